@@ -2,12 +2,12 @@
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from inspect import signature
 from typing import Any, TypedDict
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from numba.core.event import TimingListener, install_listener
@@ -287,20 +287,20 @@ def _share(rest: float, whole: float) -> float:
 
 def _streamed(scan: Scan, method: Method, _: str, bar: Bar) -> _Run:
     """A method that reads the views block by block, once, and some again for the misfit."""
-    odd = np.zeros(4, int)
+    odd = Counter[str]()
     lost: list[int] = []
     bar.phase(method.name, len(scan.cameras))
 
     def read(first: int, last: int) -> Tensor:
         part = scan.measured.read(first, last)
-        odd[:] += part.odd
+        odd.update(part.odd)
         lost.extend(lost_views(part.views, first))
         bar(last)
         return part.views
 
     solver: Any = method.module
     volume = solver.solve.streamed(read, scan.cameras, scan.grid, **solver.options)[0, 0]
-    scan.measured.warn_of_values(*odd.tolist())
+    scan.measured.warn_of_values(odd)
     compared = _compared(len(scan.cameras))
     outcome = Outcome(volume, compared_views=len(compared), lost=lost)
     return outcome, lambda: _residual(scan, volume, compared)

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import timedelta
@@ -75,7 +76,7 @@ class ViewsInMemory:
         """Each view divided by its gain."""
         return replace(self, views=self.views / gains[:, None, None])
 
-    def warn_of_values(self, saturated: int, floored: int, bright: int, negative: int) -> None:
+    def warn_of_values(self, odd: Counter[str]) -> None:
         """No warning: reading has already warned."""
 
 

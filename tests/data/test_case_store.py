@@ -44,6 +44,15 @@ def test_a_stored_case_is_generated_once_and_equals_a_new_one(tmp_path, cameras,
     assert same(again.sample(1, 5, GRID, cameras), expected)
 
 
+def check_cached(folder, cameras, acquisition, files):
+    """A case equals that without a cache, computed and read back; so many files are kept."""
+    scene = SCENES.build("ellipsoids", value=0.02)
+    expected = Acquired(scene, {"name": "drr"}, acquisition).sample(0, 0, GRID, cameras)
+    for _ in range(2):
+        assert same(measured(folder, acquisition).sample(0, 0, GRID, cameras), expected)
+    assert len(list(folder.iterdir())) == files
+
+
 def test_noise_and_gains_are_not_stored_and_detector_shifts_have_a_separate_file(tmp_path, cameras):
     for acquisition, files in (
         (None, 1),
@@ -51,11 +60,7 @@ def test_noise_and_gains_are_not_stored_and_detector_shifts_have_a_separate_file
         (Acquisition(disturbed=Disturbance(gain=0.1)), 1),
         (Acquisition(disturbed=Disturbance(shift_px=1.0)), 2),
     ):
-        scene = SCENES.build("ellipsoids", value=0.02)
-        expected = Acquired(scene, {"name": "drr"}, acquisition).sample(0, 0, GRID, cameras)
-        for _ in range(2):
-            assert same(measured(tmp_path, acquisition).sample(0, 0, GRID, cameras), expected)
-        assert len(list(tmp_path.iterdir())) == files
+        check_cached(tmp_path, cameras, acquisition, files)
 
 
 def test_views_of_a_breathing_object_have_a_file_for_each_draw_of_its_phases(tmp_path, cameras):
@@ -68,11 +73,7 @@ def test_views_of_a_breathing_object_have_a_file_for_each_draw_of_its_phases(tmp
         ({"views": 3, "breathing_mm": 2.0}, 4),
     ):
         acquisition = Acquisition.of({"closed_form": False, "disturbed": disturbed})
-        scene = SCENES.build("ellipsoids", value=0.02)
-        expected = Acquired(scene, {"name": "drr"}, acquisition).sample(0, 0, GRID, cameras)
-        for _ in range(2):
-            assert same(measured(tmp_path, acquisition).sample(0, 0, GRID, cameras), expected)
-        assert len(list(tmp_path.iterdir())) == files
+        check_cached(tmp_path, cameras, acquisition, files)
 
 
 def test_runs_with_and_without_closed_form_views_share_no_file(volume_file, tmp_path):

@@ -88,12 +88,11 @@ class Acquired(Scene):
     def unit_of_views(self, grid: Grid, cameras: Cameras) -> str:
         """Unit of the views: that of line integrals, or the projector's own."""
         source = self._source_of(grid, cameras)
-        plain = (
-            sees_integrals(source.operator)
-            if isinstance(source, Projection)
-            else bool((source.pixel.weight == 1).all())
-        )
-        if plain:
+        if isinstance(source, Projection):
+            integrals = sees_integrals(source.operator)
+        else:
+            integrals = bool((source.pixel.weight == 1).all())
+        if integrals:
             return f"{self.unit} * mm"
         return f"{(self.projector or {}).get('name')} of {self.unit}"
 

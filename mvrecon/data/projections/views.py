@@ -2,9 +2,10 @@
 
 import math
 import warnings
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
@@ -173,23 +174,14 @@ class Corrected:
     Args:
         views: line integrals, float32 (or the stored values, if not grey values).
         mask: measured pixels, no part of which is dead or saturated.
-        saturated: number of saturated pixels, before binning.
-        floored: number of pixels whose transmission was at most the floor.
-        zingers: number of pixels that were bright in a single view.
-        negative: number of line integrals below `NEGATIVE`.
+        odd: numbers of pixels by name: "saturated", before binning; "floored", whose transmission
+            was at most the floor; "zingers", bright in a single view; and "negative", line
+            integrals below `NEGATIVE`.
     """
 
     views: Float[Tensor, "m v u"]
     mask: Bool[Tensor, "m v u"]
-    saturated: int = 0
-    floored: int = 0
-    zingers: int = 0
-    negative: int = 0
-
-    @property
-    def odd(self) -> tuple[int, int, int, int]:
-        """Numbers of saturated and floored pixels, of zingers, and of negative line integrals."""
-        return self.saturated, self.floored, self.zingers, self.negative
+    odd: Counter[str] = field(default_factory=Counter)
 
 
 class MeasuredViews:
@@ -353,7 +345,7 @@ class MeasuredViews:
         start = max(0, first - beside)
         raw = self._raw(start, min(last + beside, self.n_views))
         views = raw.new_empty(last - first, *self.shape)
-        mask, odd = torch.empty_like(views, dtype=torch.bool), np.zeros(4, int)
+        mask, odd = torch.empty_like(views, dtype=torch.bool), Counter[str]()
         step = max(1, CORRECTED_PIXELS // raw[0].numel())
         for low in range(first, last, step):
             high, begin = min(low + step, last), max(start, low - beside)
@@ -362,7 +354,7 @@ class MeasuredViews:
             part = slice(low - first, high - first)
             views[part], mask[part] = one.views, one.mask
             odd += one.odd
-        return Corrected(views, mask, *odd.tolist())
+        return Corrected(views, mask, odd)
 
     def _corrected(self, raw: Float[Tensor, "n v u"], first: int, kept: slice) -> Corrected:
         """Those of stored views that are kept, from the view `first` on; the others tell zingers of
@@ -383,8 +375,8 @@ class MeasuredViews:
         mask = ~(bad | bright)
         if self.kind != "intensities":
             views = self.region.binned(values, counts=self.kind == "counts")
-            mask, negative = self.region.all_binned(mask), int((views < NEGATIVE).sum())
-            return Corrected(views, mask, zingers=int(bright.sum()), negative=negative)
+            odd = Counter(zingers=int(bright.sum()), negative=int((views < NEGATIVE).sum()))
+            return Corrected(views, self.region.all_binned(mask), odd)
         saturated = (raw >= self.saturation) & mask
         mask = self.region.all_binned(mask & ~saturated)
         light = self.region.binned(values)
@@ -396,8 +388,9 @@ class MeasuredViews:
                 f"{self.options.path}: expected light in every view, got none above the dark field "
                 f"in {name} (shutter closed, or dark and flat swapped?)"
             )
-        numbers = (int(odd.sum()) for odd in (saturated, low, bright, views < NEGATIVE))
-        return Corrected(views, mask, *numbers)
+        found = {"saturated": saturated, "floored": low, "zingers": bright}
+        found["negative"] = views < NEGATIVE
+        return Corrected(views, mask, Counter({name: int(x.sum()) for name, x in found.items()}))
 
     def _raw(self, first: int, last: int) -> Float[Tensor, "m v u"]:
         """The kept pixels of selected views, as they are stored."""
@@ -497,12 +490,12 @@ class MeasuredViews:
                 bright in a single view; most line integrals are negative.
         """
         step = max(1, pixels // math.prod(self.stack.shape))
-        odd = np.zeros(4, int)
+        odd = Counter[str]()
         for first in range(0, self.n_views, step):
             part = self.read(first, min(first + step, self.n_views))
             odd += part.odd
             yield part
-        self.warn_of_values(*odd)
+        self.warn_of_values(odd)
 
     def whole(self) -> Corrected:
         """Read all views into memory.
@@ -517,23 +510,23 @@ class MeasuredViews:
         check_memory(5 * self.n_views * rows * columns, f"All views of {self.options.path}")
         views = torch.empty(self.n_views, rows, columns)
         mask = torch.empty(self.n_views, rows, columns, dtype=torch.bool)
-        first, odd = 0, np.zeros(4, int)
+        first, odd = 0, Counter[str]()
         for part in self.chunks():
             last = first + len(part.views)
             views[first:last], mask[first:last] = part.views, part.mask
             first, odd = last, odd + part.odd
-        return Corrected(views, mask, *odd.tolist())
+        return Corrected(views, mask, odd)
 
     def _kept(self, raw: Tensor) -> Tensor:
         """The region's rows and columns of pixels on disk, in the cameras' order."""
         reversed_axes = {-2: self.options.flip_rows, -1: self.options.flip_columns}
         return self.region.cropped(raw.flip([axis for axis, yes in reversed_axes.items() if yes]))
 
-    def warn_of_values(self, saturated: int, floored: int, bright: int, negative: int) -> None:
+    def warn_of_values(self, odd: Counter[str]) -> None:
         """Warn of pixels that were saturated, at the floor or bright in a single view, if any, and
         of line integrals most of which are negative.
         """
-        if 2 * negative > (pixels := self.n_views * math.prod(self.shape)):
+        if 2 * odd["negative"] > (pixels := self.n_views * math.prod(self.shape)):
             cause = (
                 "the views are brighter than their flat field: were they taken with another "
                 "exposure or beam (views.exposure), or stored on another scale?"
@@ -541,25 +534,25 @@ class MeasuredViews:
                 else "are they line integrals (views.kind)?"
             )
             warnings.warn(
-                f"{self.options.path}: {negative} of {pixels} line integrals are below "
+                f"{self.options.path}: {odd['negative']} of {pixels} line integrals are below "
                 f"{NEGATIVE:g}; {cause}",
                 stacklevel=3,
             )
-        if bright:
+        if bright := odd["zingers"]:
             warnings.warn(
                 f"{self.options.path}: {bright} pixels of {self.n_views} views are brighter than "
                 f"all their neighbours in one view (zingers); they are filled from these and left "
                 f"out of the mask",
                 stacklevel=3,
             )
-        if saturated:
+        if saturated := odd["saturated"]:
             warnings.warn(
                 f"{self.options.path}: {saturated} pixels of {self.n_views} views are "
                 f"saturated (grey value {self.saturation:g} or more); they are left out of the "
                 f"mask",
                 stacklevel=3,
             )
-        if floored:
+        if floored := odd["floored"]:
             warnings.warn(
                 f"{self.options.path}: {floored} pixels of {self.n_views} views have a "
                 f"transmission of at most {self.options.floor:g}; they count as "

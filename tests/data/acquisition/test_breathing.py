@@ -29,6 +29,7 @@ from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
+from tests.data.acquisition.test_projectors import Slices
 
 GRID = Grid.centred(size=(16, 18, 20), spacing=(12.0, 10.0, 11.0))
 SQUARE = {"pixels": [40, 44], "pixel_mm": 9.0}
@@ -131,20 +132,6 @@ def test_views_of_each_phase_are_the_projector_s_views_of_the_deformed_object(ri
 def drawn(index):
     """The generator of the errors of a case of series 0."""
     return generator(ERRORS, mixed(0, index))
-
-
-class Slices(Drr):
-    """A projector that requires a row of pixels for each slice, like 2-D libraries, and does not
-    say that it integrates along lines.
-    """
-
-    def __init__(self, grid, cameras):
-        super().__init__(grid, cameras)
-        if cameras.shape[0] != grid.shape[0]:
-            raise ValueError("as many rows as slices")
-
-    def forward(self, volume):
-        return super().forward(volume)
 
 
 def test_views_of_a_projector_with_finer_pixels_are_averaged(monkeypatch):

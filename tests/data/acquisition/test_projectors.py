@@ -43,7 +43,9 @@ class Halved(Drr):
 
 
 class Slices(Drr):
-    """A projector that requires a row of pixels for each slice, like 2-D libraries."""
+    """A projector that requires a row of pixels for each slice, like 2-D libraries, and does not
+    declare that it integrates along lines.
+    """
 
     def __init__(self, grid, cameras):
         super().__init__(grid, cameras)

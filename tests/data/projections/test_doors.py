@@ -75,7 +75,7 @@ def test_dark_pixels_count_as_the_floor_and_are_counted(scan):
     Pillow.fromarray(values).save(scan / "view_3.tif")
     with pytest.warns(UserWarning, match="3 pixels of 12 views have a transmission of at most"):
         back = opened(scan).whole()
-    assert back.floored == 3 and back.views.isfinite().all()
+    assert back.odd["floored"] == 3 and back.views.isfinite().all()
     assert torch.allclose(back.views[3, 2, 1:4], torch.tensor(1e4).log())
 
 

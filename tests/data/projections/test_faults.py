@@ -246,8 +246,11 @@ def test_zingers_are_found_filled_and_left_out(rows, tmp_path):
     scan = opened(tmp_path / "scan.npy", dark=DARK, flat=DARK + BEAM)
     with pytest.warns(UserWarning, match=r"\d+ pixels of 64 views .*\(zingers\)"):
         back = scan.whole()
-    assert back.zingers == (~back.mask).sum() and not (~back.mask & ~torch.from_numpy(hit)).any()
-    assert back.zingers > 0.9 * hit.sum() and not any(back.mask[place] for place in pair)
+    assert (
+        back.odd["zingers"] == (~back.mask).sum()
+        and not (~back.mask & ~torch.from_numpy(hit)).any()
+    )
+    assert back.odd["zingers"] > 0.9 * hit.sum() and not any(back.mask[place] for place in pair)
     assert (back.views + torch.from_numpy(light).log()).abs()[~back.mask].mean() < 0.15
     for first, last in ((0, 1), (19, 22), (63, 64)):
         part = scan.read(first, last)
