@@ -1,8 +1,8 @@
 with cpu as (
   select rtk.forward_ms / own.forward_ms as forward, rtk.adjoint_ms / own.adjoint_ms as adjoint
-  from [experiments/01_operators/sizes/results.csv] own
-  join [experiments/01_operators/sizes/results.csv] rtk on rtk.n = own.n and rtk.part = 'rtk'
-  where own.part = 'drr' and own.method = 'joseph' and own.backend = 'cpu' and own.options not like '%rays_per_pixel%'
+  from [experiments/01_operators/results.csv] own
+  join [experiments/01_operators/results.csv] rtk on rtk.n = own.n and rtk.views = own.views and rtk.part = 'rtk'
+  where own.views = 32 and own.part = 'drr' and own.method = 'joseph' and own.backend = 'cpu' and own.options not like '%rays_per_pixel%'
 ),
 gpu as (
   select own.[case], nano.forward_ms / own.forward_ms as forward, nano.adjoint_ms / own.adjoint_ms as adjoint,
