@@ -109,23 +109,26 @@ class ClassicalStart:
             return sirt(A, views, self.start, weights=weights, momentum=True)
 
         def made(samples: Sequence[int]) -> list[Tensor]:
-            return [torch.cat([self._classical(geometry, views, sample) for sample in samples])]
+            alike = geometry.support is None and not geometry.A.per_sample
+            parts = [samples] if alike else [[sample] for sample in samples]
+            return [torch.cat([self._classical(geometry, views, part) for part in parts])]
 
         if not training:
             return made(range(len(views)))[0]
         return self._cases(made, geometry.A, self.start, views, geometry.support)[0]
 
     def _classical(
-        self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], sample: int
-    ) -> Float[Tensor, "1 1 d h w"]:
-        """Run the method on a sample's views, scaled to a mean density of about one, so that a
-        weight among its options is relative to the intensity scale.
+        self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], samples: Sequence[int]
+    ) -> Float[Tensor, "n 1 d h w"]:
+        """Run the method on the views of samples with the same operator and support, scaled to a
+        mean density of about one, so that a weight among its options is relative to the intensity
+        scale.
         """
         assert isinstance(self.start, Mapping)
-        case, A = views[sample : sample + 1], geometry.A.of_sample(sample)
-        level = content_scale(case) / typical_chord(A.grid)
-        within = {} if geometry.support is None else {"support": geometry.support[sample, 0]}
-        return METHODS.from_config(self.start, A, case / level, **within) * level
+        cases, A = views[list(samples)], geometry.A.of_sample(samples[0])
+        level = content_scale(cases) / typical_chord(A.grid)
+        within = {} if geometry.support is None else {"support": geometry.support[samples[0], 0]}
+        return METHODS.from_config(self.start, A, cases / level, **within) * level
 
 
 def normalised(

@@ -27,7 +27,7 @@ def made(monkeypatch):
     views, build = [], METHODS.from_config
 
     def counted(config, A, own, **options):
-        views.append(own)
+        views.extend(own)
         return build(config, A, own, **options)
 
     monkeypatch.setattr(METHODS, "from_config", counted)
