@@ -126,20 +126,20 @@ def test_the_result_of_a_case_is_that_of_its_operator(name):
 
 
 @pytest.mark.parametrize("name", METHODS_OF_CASES)
-@pytest.mark.parametrize("batches", [([0, 1], [1, 2]), ([0], [2, 0, 1]), ([0, 0], [1, 0])])
 @torch.no_grad()
-def test_a_batch_of_cached_and_new_cases_with_operators_of_their_own(name, batches):
+def test_a_batch_of_cached_and_new_cases_with_operators_of_their_own(name):
     grid, rig = small_rig()
     ramp = torch.linspace(0.5, 1.5, 12)
     each = [Scaled(RayTransform(grid, rig), ramp**power) for power in (0, 1, 2)]
     y = torch.cat([A(blob(A)) for A in each])
     y[2] = y[1]  # equal views of different operators
     build = METHODS_OF_CASES[name]
-    method = build()
-    for batch in batches:
-        out = method(y[batch], PerSample([each[i] for i in batch])).volume
-        alone = [build()(y[[i]], PerSample([each[i]])).volume for i in batch]
-        torch.testing.assert_close(out, torch.cat(alone), rtol=1e-5, atol=1e-6)
+    alone = torch.cat([build()(y[[i]], PerSample([each[i]])).volume for i in range(3)])
+    for batches in (([0, 1], [1, 2]), ([0], [2, 0, 1]), ([0, 0], [1, 0])):
+        method = build()
+        for batch in batches:
+            out = method(y[batch], PerSample([each[i] for i in batch])).volume
+            torch.testing.assert_close(out, alone[batch], rtol=1e-5, atol=1e-6)
 
 
 @torch.no_grad()
