@@ -625,34 +625,34 @@ def test_times_of_one_file_are_compared_in_one_unit(unit, tmp_path):
     np.testing.assert_allclose(found, plain + np.log(2), atol=1e-5)
 
 
-ATTENUATED = np.where(KEYS == 1, 0.01, 1.0)
+ATTENUATED = np.where(KEYS == 1, 0.5, 1.0)
 SHARES = ("instrument/attenuator", "instrument/filter_2")
 
 
 @pytest.mark.parametrize("where", SHARES)
 def test_attenuators_of_nexus_are_applied_by_their_name(where, tmp_path):
-    """A flat field behind an attenuator is warned of as a hundred times as dark; without it a time
-    alone is refused, with the product.
+    """A flat field behind an attenuator is warned of; a time without it is refused, with their
+    product.
     """
     name = f"{where}/attenuator_transmission"
     path = monitored(tmp_path / "a.nxs", {name: ATTENUATED, "count_time": FLAT_OF})
     plain = opened(tomo(tmp_path / "b.nxs"), find_bad_pixels=False).whole().views.numpy()
-    with pytest.warns(UserWarning, match=f"the flat field has the {name} 0.01, its views have 1"):
+    with pytest.warns(UserWarning, match=f"the flat field has the {name} 0.5, its views have 1"):
         opened(path, find_bad_pixels=False)
     with pytest.raises(Refused, match=rf"views.exposure=count_time\*{name} if light"):
         opened(path, exposure="count_time", find_bad_pixels=False)
     found = opened(path, exposure=f"count_time * {name}", find_bad_pixels=False).whole().views
-    np.testing.assert_allclose(found.numpy(), plain + np.log(200), atol=1e-5)
+    np.testing.assert_allclose(found.numpy(), plain + np.log(4), atol=1e-5)
 
 
 def test_two_attenuators_multiply_the_light(tmp_path):
     one, two = (f"{where}/attenuator_transmission" for where in SHARES)
-    path = monitored(tmp_path / "a.nxs", {one: ATTENUATED, two: np.where(KEYS == 1, 1.0, 0.5)})
+    path = monitored(tmp_path / "a.nxs", {one: ATTENUATED, two: np.where(KEYS == 1, 1.0, 0.2)})
     with pytest.raises(Refused, match=re.escape(f"views.exposure={one}*{two} if light")):
         opened(path, exposure=one, find_bad_pixels=False)
     plain = opened(tomo(tmp_path / "b.nxs"), find_bad_pixels=False).whole().views.numpy()
     found = opened(path, exposure=f"{two}*{one}", find_bad_pixels=False).whole().views
-    np.testing.assert_allclose(found.numpy(), plain + np.log(50), atol=1e-5)
+    np.testing.assert_allclose(found.numpy(), plain + np.log(0.4), atol=1e-5)
 
 
 BEAMS = {
