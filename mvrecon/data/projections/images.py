@@ -46,7 +46,8 @@ PNG_KEYS = (
     Key("acTL", "refused", "one image in each file"),
     Key("pCAL", "refused", "store the values that the calibration gives"),
     Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
-    Key("gAMA, pHYs, oFFs, sCAL, tRNS", "ignored", "display, origin and print size"),
+    Key("gAMA, sRGB, iCCP, cICP, cHRM, tRNS", "ignored", "display alone"),
+    Key("pHYs, oFFs, sCAL", "ignored", "origin and print size"),
     Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
 )
 #: Attributes of DICOM projections that all views have in common.
@@ -114,6 +115,7 @@ DICOM_KEYS = (
     ),
     Key(", ".join(BEAM), "compared", "of views and flat fields; warned of"),
     Key("ExposureIndex, DeviationIndex", "ignored", "of the grey values, also of the object"),
+    Key("ImageAndFluoroscopyAreaDoseProduct", "ignored", "may be a sum over images"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),

@@ -114,6 +114,11 @@ KEYS = (
     ),
     Key("field_of_view, estimated_cor_from_motor, x_rotation_axis_pixel_position", "ignored", AXIS),
     Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
+    Key(
+        "flatfield, dead_time, countrate_correction_lookup_table",
+        "ignored",
+        "the detector's own; flat fields correct unequal pixels",
+    ),
     *nexus_axes.KEYS,
 )
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.

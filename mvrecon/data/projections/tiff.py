@@ -15,6 +15,8 @@ from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import VIEWS, Header
 
+#: Tags of EXIF on which grey values depend, but not in a proportion that all cameras share.
+EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureBiasValue")
 #: Tags of TIFF that change the pixels or their order.
 TIFF_KEYS = (
     Key("BitsPerSample", "applied", "also gives the largest grey value"),
@@ -52,6 +54,7 @@ TIFF_KEYS = (
         "compared",
         "of all views, also in EXIF, in ms as in DICOM; warned of, applied by views.exposure",
     ),
+    Key(", ".join(EXIF_BEAM), "compared", "of views and flat fields, also in EXIF; warned of"),
     Key("Decode", "refused", "store the values of its range"),
     Key("StoNits", "refused", "store the values that the factor gives", (1,)),
     Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
@@ -232,6 +235,9 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
     ratios = [s if isinstance(s, tuple) else (s, 1) for s in exposed if s is not None]
     times = {descriptions.milliseconds(file, s / unit, "s") for s, unit in ratios if unit}
     stated = {"ExposureTime": [" or ".join(sorted(times))]}
+    for name in EXIF_BEAM:
+        if (value := exif.get(name, page.tags.valueof(name))) is not None:
+            stated[name] = [str(value)]
     head = Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
     manager = page.tags.valueof("MicroManagerMetadata")
     return descriptions.of_page(file, head, page.description, manager)
