@@ -569,11 +569,13 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
     """What a data set states, as texts; "" of what is not finite, or of an unknown unit.
 
     Raises:
-        Refused: an exposure that is no number.
+        Refused: an exposure that is no number, or many texts.
     """
     text = texts_at([place], "", EXPECTED).get(place, "").strip()  # or the type of numbers
     beam, number = exposures.kind_of(name) == "beam", NUMBER.fullmatch(text)
     if beam and not NUMERIC.fullmatch(text):
+        if re.fullmatch(r"object|\|S\d+", text):  # texts of each frame
+            raise Refused(f"{place}: expected one {name} of all frames, got many texts")
         return [text]
     if number:
         values, unit = np.array([float(number[1])]), number[2] or unit

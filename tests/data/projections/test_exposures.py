@@ -685,6 +685,17 @@ def test_other_settings_of_nexus_are_warned_of(name, tmp_path):
             opened(tomo(tmp_path / "3.nxs", **{place: several}), find_bad_pixels=False)
 
 
+@pytest.mark.parametrize("kind", ["S4", h5py.string_dtype()])
+def test_settings_of_nexus_as_a_text_of_each_frame_are_warned_of(kind, tmp_path):
+    """They are not compared."""
+    texts = np.array([b"high", b"low"] * len(KEYS))[: len(KEYS)].astype(kind)
+    path = tomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        file.create_dataset("entry/instrument/detector/gain_setting", data=texts, dtype=kind)
+    with pytest.warns(UserWarning, match="gain_setting: expected one .* it is not used"):
+        opened(path, find_bad_pixels=False)
+
+
 TEXTS = {
     "a number": ("0.1", 2),
     "in s": ("0.1 s", 2),
