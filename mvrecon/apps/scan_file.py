@@ -9,7 +9,7 @@ found; `mvrecon-reconstruct scan=FOLDER`, or `scan=FILE`, takes it as if it were
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ import yaml
 
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, from_home, yaml_of
+from mvrecon.core.files.checks import MAX_YAML_BYTES, Refused, from_home, text_of, yaml_of
 from mvrecon.core.options import with_paths
 from mvrecon.core.registry import hint
 
@@ -29,6 +29,8 @@ SECTIONS = ("views", "camera", "projector", "grid")
 DATA_SETS = ("angles", "image_key")
 #: Values: numbers, words or patterns of names, and paths; nothing that refers or computes.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+"), re.compile(r"[\w.+/: -]+")
+#: What OmegaConf would resolve, outside of comments.
+REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
 
 
 def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> None:
@@ -36,9 +38,22 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
     working folder, are written as they begin in the file's.
     """
     told = {key: dict(value) for key, value in description.items() if value is not None}
-    told = with_paths(told, ReconstructSettings, lambda path, _: _from_folder(file.parent, path))
+    told = _with_paths(told, lambda path: _from_folder(file.parent, path))
     with written_whole(file) as part:
         part.write_text(yaml.safe_dump(told, sort_keys=False), encoding="utf-8")
+
+
+def _with_paths(
+    told: dict[str, dict[str, Any]], change: Callable[[str], str | Path]
+) -> dict[str, Any]:
+    """Change every path; attributes by which views state their exposure are none."""
+    changed = with_paths(told, ReconstructSettings, lambda path, _: change(path))
+    if isinstance(exposure := told.get("views", {}).get("exposure"), str):
+        from mvrecon.data.projections.exposures import named  # imports torch
+
+        if names := named(exposure):
+            changed["views"]["exposure"] = "*".join(names)
+    return changed
 
 
 def _from_folder(folder: Path, path: str) -> str:
@@ -98,6 +113,11 @@ def _found(place: Path) -> Path:
 
 def _settings(file: Path) -> Iterator[str]:
     """The lines of a command line that a file stands for; its paths begin in its folder."""
+    if refers := REFERS.search(text_of(file, MAX_YAML_BYTES)):
+        raise Refused(
+            f"{file}: expected plain values, got {refers[1]}, which is not resolved in {NAME}; "
+            f"write what it stands for, paths as they begin in its folder"
+        )
     told = yaml_of(file)
     if not isinstance(told, dict) or not all(isinstance(part, dict) for part in told.values()):
         raise Refused(f"{file}: expected sections such as views: {{path: projections}}")
@@ -109,7 +129,7 @@ def _settings(file: Path) -> Iterator[str]:
     for key in {*DATA_SETS} & {*views}:
         if isinstance(name := views[key], str) and ":" not in name:
             views[key] = f"/{name.lstrip('/')}"  # else a file beside this one
-    told = with_paths(told, ReconstructSettings, lambda path, _: file.parent / path)
+    told = _with_paths(told, lambda path: file.parent / path)
     for section, options in told.items():
         if (name := options.pop("name", "from_file")) != "from_file":
             yield f"{section}={_word(file, section, name)}"

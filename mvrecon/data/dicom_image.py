@@ -61,6 +61,7 @@ KEYS = (
     ),
     Key("SamplesPerPixel", "refused", "one grey value per pixel", (1,)),
     Key("PlanarConfiguration", "ignored", "of colours"),
+    Key("LossyImageCompression", "ignored", "values are those that are decoded"),
     Key("WindowCenter, VOILUTSequence, PresentationLUTShape", "ignored", "display alone"),
     Key("MaskSubtractionSequence, FramePixelShiftSequence", "ignored", "display alone"),
 )

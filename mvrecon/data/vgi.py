@@ -21,11 +21,15 @@ from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect, sectio
 from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.geometry.grid import Grid
 
+#: Types of values, and the bits that they have.
 TYPES = {"unsigned integer": "u", "signed integer": "i", "float": "f"}
+BITS = {"u": (8, 16, 32, 64), "i": (8, 16, 32, 64), "f": (32, 64)}
 KEYS = (
     Key("size, name, datatype, bitsperelement, skipheader", "applied", "of [file1]"),
     Key("resolution, unit", "applied", "of [geometry]; the volume's centre is the origin"),
-    Key("representation.size, representation.datarange", "compared", "with those of [file1]"),
+    Key("representation.size, representation.datatype", "compared", "with those of [file1]"),
+    Key("representation.bitsperelement", "compared", "with that of [file1]"),
+    Key("datarange", "compared", "with that of [file1], and with all values, unless 0 -1"),
     Key("regionofinterestend", "compared", "with size of [file1]: the last voxel"),
     Key("fileformat", "refused", "plain numbers, little endian", ("raw",)),
     *(
@@ -44,11 +48,14 @@ KEYS = (
     Key("file2.name", "refused", "all values in one file"),
     Key("center", "ignored", "of the rotation"),
     Key("status, text", "ignored", "of the display"),
+    Key("[calibration], [mapping]", "refused", "and sections of the like: apply what they state"),
 )
 
 #: Sections whose unknown keys are checked, known keys, and the words of unknown ones.
 SECTIONS = ("[representation]", "[file1]", "[geometry]")
 KNOWN = {name for key in KEYS for name in key.names}
+#: Values of an entry that states nothing, and the share of a range that its text rounds.
+NOTHING, ROUNDING = ("", "none", "no", "false", "off", "not activated", "invisible"), 1e-5
 VGI_EFFECTS = {**EFFECTS, "mapping|swap|origin|translat|transform|shear|header.?size": None}
 
 
@@ -58,6 +65,60 @@ def _plain(text: str) -> str:
         return " ".join(f"{float(word) + 0.0:g}" for word in text.split())
     except ValueError:
         return text
+
+
+def _entries(path: Path) -> dict[str, str]:
+    """The entries of a .vgi by their sections, as `file1.size`.
+
+    Raises:
+        Refused: several volumes, unknown entries that change values or geometry, or two sections
+            that state other values.
+    """
+    entries: dict[str, str] = {}
+    for section, name, value in section_entries(path):
+        name = f"{section.strip('[]')}.{name}"
+        alone = section == "[file1]" or name in ("geometry.resolution", "geometry.unit")
+        if entries.setdefault(name, value) != value and alone:
+            raise Refused(f"{path}: expected one volume, got the {name} {shown(value)} as well")
+        unknown = section in SECTIONS and name not in KNOWN and name.partition(".")[2] not in KNOWN
+        effect = unknown and has_effect(name, value, VGI_EFFECTS)
+        if section not in SECTIONS and has_effect(section, "", VGI_EFFECTS):  # [calibration]
+            effect = _plain(value).lower() not in NOTHING
+        if effect:
+            raise Refused(
+                f"{path}: expected keys of VGStudio whose effect is known, got {name} "
+                f"{shown(value)}; apply it, and remove the key"
+            )
+    for name in ("size", "datarange", "datatype", "bitsperelement"):
+        pair = [entries.get(f"{place}.{name}", "") for place in ("representation", "file1")]
+        if pair[0] and " ".join(pair[0].lower().split()) != " ".join(pair[1].lower().split()):
+            raise Refused(
+                f"{path}: expected the {name} {shown(pair[0])} of [representation] in [file1], got "
+                f"{shown(pair[1])}"
+            )
+    return entries
+
+
+def _range(path: Path, text: str, dtype: np.dtype) -> tuple[float, float]:
+    """The range of values, infinite unless it is stated, and larger by its rounding.
+
+    Raises:
+        Refused: no range, or one that integers of this type cannot have.
+    """
+    if _plain(text) in ("", "0 -1"):
+        return -math.inf, math.inf
+    with file_errors(path, "has no datarange", "expected two numbers"):
+        low, high = (float(word) for word in text.split())
+        ends = (-math.inf, math.inf)
+        if dtype.kind != "f":
+            ends = (float(np.iinfo(dtype).min), float(np.iinfo(dtype).max))
+        if not ends[0] <= low < high <= ends[1]:
+            raise Refused(
+                f"{path}: expected a datarange of values of {dtype.name} as they are stored, got "
+                f"{text}; store the values that it gives"
+            )
+        rounding = ROUNDING * max(abs(low), abs(high))
+        return low - rounding, high + rounding
 
 
 def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
@@ -73,18 +134,7 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
     """
     path = Path(path).expanduser()
     check_file(path, "VGStudio's .vgi")
-    entries: dict[str, str] = {}
-    for section, name, value in section_entries(path):
-        name = f"{section.strip('[]')}.{name}"
-        alone = section == "[file1]" or name in ("geometry.resolution", "geometry.unit")
-        if entries.setdefault(name, value) != value and alone:
-            raise Refused(f"{path}: expected one volume, got the {name} {shown(value)} as well")
-        unknown = section in SECTIONS and name not in KNOWN and name.partition(".")[2] not in KNOWN
-        if unknown and has_effect(name, value, VGI_EFFECTS):
-            raise Refused(
-                f"{path}: expected keys of VGStudio whose effect is known, got {name} "
-                f"{shown(value)}; apply it, and remove the key"
-            )
+    entries = _entries(path)
 
     def numbers(name: str, count: int) -> list[float]:
         with file_errors(path, f"has no {name}", "expected numbers"):
@@ -96,13 +146,6 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
     for start in (*(f"{section.strip('[]')}." for section in SECTIONS), ""):
         own = {n.removeprefix(start): _plain(v) for n, v in entries.items() if n.startswith(start)}
         check_keys(path, KEYS, own.get)
-    for name in ("size", "datarange", "datatype", "bitsperelement"):
-        pair = [entries.get(f"{place}.{name}", "") for place in ("representation", "file1")]
-        if pair[0] and " ".join(pair[0].lower().split()) != " ".join(pair[1].lower().split()):
-            raise Refused(
-                f"{path}: expected the {name} {shown(pair[0])} of [representation] in [file1], got "
-                f"{shown(pair[1])}"
-            )
     x, y, z = (int(n) for n in numbers("file1.size", 3))
     end = _plain(entries.get("file1.regionofinterestend", ""))
     if end not in ("", f"{x - 1} {y - 1} {z - 1}", f"{x} {y} {z}"):
@@ -110,6 +153,8 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
     kind, bits = entries.get("file1.datatype", "").lower(), numbers("file1.bitsperelement", 1)[0]
     unit = millimetres(path, entries.get("geometry.unit", ""))
     with file_errors(path, "has no known type of values"):
+        if bits not in BITS[TYPES[kind]]:
+            raise Refused(f"{path}: expected BitsPerElement {BITS[TYPES[kind]]}, got {bits:g}")
         dtype = np.dtype(f"<{TYPES[kind]}{int(bits) // 8}")
         mm = [size * unit for size in numbers("geometry.resolution", 3)]
         skip = int(entries.get("file1.skipheader", "0") or 0)
@@ -120,6 +165,7 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
     check_declared(path, (z, y, x), dtype.itemsize, data, skip)
     if (got := data.stat().st_size) != skip + x * y * z * dtype.itemsize:
         raise Refused(f"{path}: expected {skip + x * y * z * dtype.itemsize} bytes, got {got}")
+    low, high = _range(path, entries.get("file1.datarange", ""), dtype)
 
     def passes() -> Iterator[Slab]:
         step = planes(y * x)
@@ -129,6 +175,12 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
                 slab = torch.from_numpy(values[first : first + step].astype("float32"))
                 if not slab.isfinite().all():
                     raise Refused(f"{data}: expected finite values, got NaN or infinite ones")
+                if (least := slab.min().item()) < low or (most := slab.max().item()) > high:
+                    got = f"{least:g}" if least < low else f"{most:g}"
+                    raise Refused(
+                        f"{path}: expected values within the datarange "
+                        f"{entries['file1.datarange']}, got {got}; store the values that it gives"
+                    )
                 yield first, slab
 
     grid = Grid.centred(size=(x, y, z), spacing=(mm[0], mm[1], mm[2]))

@@ -60,7 +60,9 @@ def test_the_only_case_of_a_simulation_is_found_and_several_are_named(folder: Pa
         ({"plugins": {"a": "b"}}, "no section is 'plugins'. Known: camera, grid, proj"),
         ({"view": {"path": "a"}}, "did you mean 'views'"),
         ({"views": ["a"]}, "expected sections"),
-        ({"views": {"path": "${oc.env:HOME}"}}, "as views.path, got"),
+        ({"views": {"path": "${oc.env:HOME}"}}, r"got \$\{oc.env:HOME\}, which is not resolved"),
+        ({"views": {"path": "a/${b}/c"}}, r"got \$\{b\}, which is not resolved in scan.yaml"),
+        ({"camera": {"name": "arc", "sid": "${views.every}"}}, r"got \$\{views.every\}"),
         ({"views": {"path": "a,b"}}, "as views.path, got"),
         ({"camera": {"name": "arc sid=3"}}, "as camera, got"),
         ({"camera": {"sid=3 out": 1}}, "expected names of settings in camera"),
@@ -135,9 +137,24 @@ def test_a_name_told_twice_and_one_that_refers_are_refused(folder: Path):
     with pytest.raises(Refused, match="every name once, got several 'sid'"):
         expanded([f"scan={folder}"])
     (folder / "${oc.env:HOME}").mkdir()
-    (folder / NAME).write_text("views: {path: '${oc.env:HOME}'}")
-    with pytest.raises(Refused, match=r"as views\.path, got"):
-        expanded([f"scan={folder}"])
+    for text in ("views: {path: '${oc.env:HOME}'}", "views: {path: ${oc.env:HOME}}"):
+        (folder / NAME).write_text(text)
+        with pytest.raises(Refused, match=r"got \$\{oc.env:HOME\}, which is not resolved"):
+            expanded([f"scan={folder}"])
+    (folder / NAME).write_text("# as ${oc.env:HOME}\nviews: {every: 2}  # ${a}\n")
+    assert expanded([f"scan={folder}"]) == ["views.every=2"]
+
+
+@pytest.mark.parametrize("name", ["ExposureTime", "count_time*control/data", "a.csv"])
+def test_names_of_exposures_are_no_paths(name: str, folder: Path, monkeypatch):
+    """Written by hand, also with blanks, or by `save`; a table beside the description is one."""
+    (folder / "a.csv").touch()
+    expected = [f"views.exposure={folder / name if name == 'a.csv' else name}"]
+    (folder / NAME).write_text(yaml.safe_dump({"views": {"exposure": name.replace("*", " * ")}}))
+    assert expanded([f"scan={folder}"]) == expected
+    monkeypatch.chdir(folder)
+    save(folder / NAME, {"views": {"exposure": name}})
+    assert expanded([f"scan={folder}"]) == expected
 
 
 @pytest.mark.parametrize("typed", ["scan={}", "+scan={}", "scan='{}'", 'scan="{}"'])

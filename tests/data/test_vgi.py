@@ -47,6 +47,11 @@ def test_a_volume_of_vgstudio_has_its_values_and_voxels(kind, bits, dtype, tmp_p
     assert np.allclose(grid.spacing, (0.5, 0.25, 2.0))
 
 
+def _ranged(text, **changed):
+    """A range of values in both places."""
+    return {"representation__datarange": text, "file1__datarange": text, **changed}
+
+
 REFUSED = {
     "cut short": ({"values": VALUES[:1].astype("<f4")}, "is it cut short|expected .* bytes"),
     "longer": ({"bits": 16, "kind": "signed integer"}, "expected 48 bytes, got 96"),
@@ -79,6 +84,20 @@ REFUSED = {
     ),
     "moved by another key": ({"geometry__translation": "5 0 0"}, "translation '5 0 0'; apply it"),
     "inches": ({"unit": "inch"}, "expected units of m, cm"),
+    "half of the bits": ({"bits": 16, "values": FLOATS.astype("<f2")}, "BitsPerElement .32, 64"),
+    "bits of no whole bytes": ({"bits": 33}, "BitsPerElement .32, 64.*got 33"),
+    "12 bits": ({"kind": "unsigned integer", "bits": 12}, "BitsPerElement .8, 16, 32, 64"),
+    "other bits in the head": ({"representation__bitsperelement": 16}, "expected the bitsper"),
+    "values beyond a range": (_ranged("0 10"), "within the datarange 0 10, got -3"),
+    "values above a range": (_ranged("-3 19.9"), "within the datarange -3 19.9, got 20"),
+    "a range beyond the type": (
+        _ranged("0 65535", kind="unsigned integer", bits=8, values=(VALUES + 3).astype("u1")),
+        "expected a datarange of values of uint8",
+    ),
+    "a range of half a number": (_ranged("0"), "has no datarange"),
+    "calibrated": ({"calibration__factor": 2}, "calibration.factor '2'; apply it"),
+    "calibrated by materials": ({"calibration1__air": "12000"}, "calibration1.air '12000'"),
+    "mapped elsewhere": ({"datamapping__low": "-1000"}, "datamapping.low '-1000'; apply it"),
     "NaN": ({"values": VALUES.astype("<f4") * np.nan}, "expected finite values"),
 }
 
@@ -100,5 +119,7 @@ def test_entries_of_vgstudio_that_change_nothing_are_accepted(tmp_path):
         **{"geometry__position": "-0 0 0", "geometry__scale": "1.0 1 1"},
         **{"geometry__center": "2 1.5 1", "geometry__rotate": "1 0 0 0 1 0 0 0 1"},
     }
-    volume, grid = read_volume(vgi(tmp_path, **neutral))
-    assert np.array_equal(volume.numpy(), VALUES) and np.allclose(grid.centre, 0)
+    neutral |= {"calibration__status": "off", "description__text": "calibrated", "view__scale": 3}
+    for text in ("0 -1", "-3 20", "-1e3 1e3", "-3.00001 20"):
+        volume, grid = read_volume(vgi(tmp_path, **neutral, **_ranged(text)))
+        assert np.array_equal(volume.numpy(), VALUES) and np.allclose(grid.centre, 0)

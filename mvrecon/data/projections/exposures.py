@@ -9,20 +9,27 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, shown
 from mvrecon.data.projections.stack import ProjectionStack
 
 #: Attributes in proportion to light by what of an exposure they measure: its time, the rate of the
-#: beam, or both ("whole"). Of those that are "vague" a file does not say which: a monitor may
-#: measure a rate or a sum, and frames may be summed in the exposure time, beside it, or averaged.
+#: beam, both ("whole"), or the "share" of these that passes an attenuator. Of those that are
+#: "vague" a file does not say which: a monitor may measure a rate or a sum, and frames may be
+#: summed in the exposure time, beside it, or averaged.
 DICOM = {
     **dict.fromkeys(("ExposureTime", "ExposureTimeInuS", "ExposureTimeInms"), "time"),
     **dict.fromkeys(("XRayTubeCurrent", "XRayTubeCurrentInuA", "XRayTubeCurrentInmA"), "rate"),
     **dict.fromkeys(("Exposure", "ExposureInuAs", "ExposureInmAs", "MetersetExposure"), "whole"),
+    **dict.fromkeys(("EntranceDose", "EntranceDoseInmGy"), "whole"),
     **dict.fromkeys(
         ("AveragePulseWidth", "InternalDetectorFrameTime", "NumberOfFramesIntegrated"), "vague"
     ),
+    **dict.fromkeys(("FrameAcquisitionDuration", "RelativeXRayExposure"), "vague"),
 }
+#: In the header of a TIFF of Dectris, beside its time.
+DECTRIS = {"Filter_transmission": "share"}
+#: Among the counters of an EDF, the current of the ESRF's storage ring.
+EDF = {"srcur": "rate"}
 #: In an entry of NeXus, and in its detector.
 MONITORS = {
     "control/data": "vague",
@@ -34,31 +41,103 @@ DETECTOR = {
     "count_time": "time",
     "exposure_time": "time",
     "frame_time": "vague",
+    "real_time": "vague",
     "number_of_cycles": "vague",
 }
 #: The time of views in Data Exchange, among them.
 EXCHANGE = "exposure_time"
-KINDS = {**DICOM, **MONITORS, **DETECTOR}
+#: Of each attenuator in an instrument of NeXus, behind the path of its group.
+ATTENUATOR = "attenuator_transmission"
+KINDS = {**DICOM, **DECTRIS, **EDF, **MONITORS, **DETECTOR}
 #: Attributes of one quantity, by their units.
 UNITS = (
     {"ExposureTime": 1.0, "ExposureTimeInms": 1.0, "ExposureTimeInuS": 1e-3},
     {"XRayTubeCurrent": 1.0, "XRayTubeCurrentInmA": 1.0, "XRayTubeCurrentInuA": 1e-3},
     {"Exposure": 1.0, "ExposureInmAs": 1.0, "ExposureInuAs": 1e-3},
+    {"EntranceDoseInmGy": 1.0, "EntranceDose": 100.0},
 )
-#: Attributes that DICOM rounds to whole ms, mA and mAs.
-ROUNDED = ("ExposureTime", "XRayTubeCurrent", "Exposure")
+#: Attributes that DICOM rounds to whole ms, mA, mAs and dGy.
+ROUNDED = ("ExposureTime", "XRayTubeCurrent", "Exposure", "EntranceDose")
+#: Prefixes of units, and the units of exposure times in s and of a beam's current in A; without one
+#: they are these.
+PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
+PREFIXES |= {"milli": 1e-3, "micro": 1e-6, "nano": 1e-9}
+SECONDS, AMPERES = (
+    {"": 1.0, **{start + name: part for start, part in PREFIXES.items() for name in names}}
+    for names in (("s", "sec", "second", "seconds"), ("a", "amp", "ampere", "amperes"))
+)
+SECONDS |= dict.fromkeys(("min", "minute", "minutes"), 60.0)
+SECONDS |= dict.fromkeys(("h", "hour", "hours"), 3600.0)
 #: Relative difference of exposures, or of the beam, that counts.
 MAX_CHANGE = 0.01
 
 
-def exposure_names(views: ProjectionStack, exposure: str | Path | None) -> list[str]:
-    """The attributes of views that are joined by `*` in an option; empty if it is a file, or if
-    views do not all state them.
+def kind_of(name: str) -> str:
+    """What an attribute measures of an exposure; "beam" of others, to which light is not in
+    proportion.
     """
-    names = str(exposure).split("*")
-    if exposure is None or Path(exposure).expanduser().exists() or not {*names} <= {*KINDS}:
-        return []
-    return [] if views.exposure(*names) is None else names
+    return "share" if name.endswith(f"/{ATTENUATOR}") else KINDS.get(name, "beam")
+
+
+def in_base_units(values: np.ndarray, name: str, unit: str, where: object) -> np.ndarray:
+    """Times in s and currents in A; other attributes as they are.
+
+    Args:
+        values: of an attribute.
+        name: of it.
+        unit: as the file states it; "" of none.
+        where: it is stated, for the message.
+
+    Warns:
+        UserWarning: an unknown unit; the values are NaN.
+    """
+    last = name.rpartition("/")[2].lower()
+    known = SECONDS if "time" in last else AMPERES if "current" in last else None
+    factor = 1.0 if known is None else known.get(unit.strip().lower(), np.nan)
+    if np.isnan(factor):
+        such = "s or ms" if known is SECONDS else "A or mA"
+        warnings.warn(
+            f"{where}: expected the {name} in units such as {such}, got {shown(unit)}; it is not "
+            f"used",
+            stacklevel=3,
+        )
+    return values * factor
+
+
+def named(exposure: str | Path) -> list[str]:
+    """The attributes that are joined by `*` in an option; empty if it is a file, or others."""
+    names = [name.strip() for name in str(exposure).split("*")]
+    known = all(kind_of(name) != "beam" for name in names)
+    return names if known and not Path(exposure).expanduser().exists() else []
+
+
+def exposure_names(views: ProjectionStack, exposure: str | Path | None) -> list[str]:
+    """The attributes of `named`; empty if views do not all state them."""
+    names = [] if exposure is None else named(exposure)
+    return names if names and views.exposure(*names) is not None else []
+
+
+def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "") -> None:
+    """Warn of views that state several values of an attribute.
+
+    Args:
+        path: of the views.
+        name: of the attribute.
+        texts: of each view; "" of none, several joined by " or ".
+        cure: what to do; by default, that of exposure and beam.
+    """
+    stated = {word for text in texts for word in text.split(" or ")} - {""}
+    own = "" if kind_of(name) == "beam" else f"{name} or "
+    cure = cure or (
+        f"for which their grey values are not corrected but by views.exposure={own}<file> with "
+        f"exposures relative to the flat field's"
+    )
+    if len(stated) > 1:
+        warnings.warn(
+            f"{path}: views have several values of {name}, {' or '.join(sorted(stated)[:3])}, "
+            f"{cure}",
+            stacklevel=3,
+        )
 
 
 def relative_exposure(
@@ -131,20 +210,25 @@ def _others(
     """Products of attributes that must change as that of `names`, and whether they may be constant
     instead.
     """
-    stated = [name for name in KINDS if _relative(views, flat, [name]) is not None]
-    kinds = {KINDS[name] for name in names}
+    stated = [
+        name
+        for name in views.stated
+        if kind_of(name) != "beam" and _relative(views, flat, [name]) is not None
+    ]
+    kinds = {kind_of(name) for name in names}
     for name in stated:
-        if name not in names and "vague" in (KINDS[name], *kinds):
+        if name not in names and "vague" in (kind_of(name), *kinds):
             yield (name,), True
     if "vague" in kinds:
         return
     times, rates, whole = (
-        [(name,) for name in stated if KINDS[name] == kind] for kind in ("time", "rate", "whole")
+        [(name,) for name in stated if kind_of(name) == kind] for kind in ("time", "rate", "whole")
     )
-    yield from ((product, False) for product in whole)
+    shares = tuple(name for name in stated if kind_of(name) == "share")
+    yield from ((product + shares, False) for product in whole)
     if "whole" not in kinds:  # what is not stated is taken to be constant
         times, rates = times or [()], rates or [()]
-    yield from ((time + rate, False) for time in times for rate in rates)
+    yield from ((time + rate + shares, False) for time in times for rate in rates)
 
 
 def _words(values: np.ndarray | None) -> str:
@@ -164,7 +248,7 @@ def warn_of_others(
         applied: attributes that `relative_exposure` applies, and to which it compares others.
     """
     for key, texts in views.stated.items():
-        kind = KINDS.get(key, "beam")
+        kind = kind_of(key)
         if (name == "dark" and kind != "time") or (name == "flat" and applied and kind != "beam"):
             continue
         if kind == "beam":

@@ -86,7 +86,7 @@ def fields(
         raise Refused(
             f"{where}: expected at least half of the pixels between dark and saturated, got "
             f"{int(alive.sum())} of {alive.numel()}; flat field's largest grey value "
-            f"{flat.max().item():g}, saturation {saturation:g}"
+            f"{flat.max().item():g}, saturation {saturation:g} (views.saturation states another)"
         )
     level = contrast.clamp(min=1e-6 * middle).log()
     for off, least in (

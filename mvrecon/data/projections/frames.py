@@ -7,6 +7,9 @@ from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.linked import Place, beside, check_around, followed
@@ -135,7 +138,9 @@ class FrameViews(ProjectionStack):
         fields: flat and dark fields.
         rig: that the file states.
         folder: other files must be in it, or below.
-        exposures: of all frames, by their names; NaN where the file states none.
+        stated: of the exposure and the beam of all frames, by name: a text for each, "" of none.
+        marked: bad pixels.
+        top: greatest grey value; None: that of the type.
     """
 
     def __init__(
@@ -145,18 +150,26 @@ class FrameViews(ProjectionStack):
         fields: dict[str, ProjectionStack] | None = None,
         rig: dict[str, Any] | None = None,
         folder: Path | None = None,
-        exposures: Mapping[str, np.ndarray] | None = None,
+        stated: Mapping[str, np.ndarray] | None = None,
+        marked: np.ndarray | None = None,
+        top: float | None = None,
     ):
         self._frames, self._numbers, self._folder = frames, numbers, folder
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig = fields or {}, rig
-        self.stated = {
-            name: [f"{x:.12g}" if np.isfinite(x) else "" for x in values[numbers]]
-            for name, values in (exposures or {}).items()
-        }
+        self.stated = {name: texts[numbers].tolist() for name, texts in (stated or {}).items()}
+        self._marked, self._top = marked, top
         if "flat" in self.fields:
             self.kind = "intensities"
+
+    @property
+    def marked(self) -> Bool[Tensor, "v u"] | None:
+        return None if self._marked is None else torch.from_numpy(self._marked)
+
+    @property
+    def top(self) -> float | None:
+        return super().top if self._top is None else self._top
 
     def field_at(self, name: str) -> ProjectionStack | None:
         place = followed(self._frames.place.path, name, EXPECTED, self._folder)

@@ -11,11 +11,15 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
@@ -42,7 +46,9 @@ PNG_KEYS = (
     Key("acTL", "refused", "one image in each file"),
     Key("pCAL", "refused", "store the values that the calibration gives"),
     Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
-    Key("gAMA, sBIT, pHYs, oFFs, sCAL, tRNS", "ignored", "display, origin and print size"),
+    Key("gAMA, sRGB, iCCP, cICP, cHRM, tRNS", "ignored", "display alone"),
+    Key("pHYs, oFFs, sCAL", "ignored", "origin and print size"),
+    Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
 )
 #: Attributes of DICOM projections that all views have in common.
 ALIKE = (
@@ -59,8 +65,13 @@ ALIKE = (
 )
 #: Attributes of DICOM projections that change grey values, but not in proportion.
 BEAM = (
-    *("KVP", "AnodeTargetMaterial", "Sensitivity", "FilterMaterial", "FilterType"),
+    *("KVP", "AnodeTargetMaterial", "HalfValueLayer", "XRayOutput", "RadiationMode"),
+    *("RadiationSetting", "ExposureStatus", "Sensitivity", "DetectorMode"),
+    *("FilterMaterial", "FilterType", "TypeOfFilters"),
     *("FilterThicknessMinimum", "FilterThicknessMaximum"),
+    *("FilterBeamPathLengthMinimum", "FilterBeamPathLengthMaximum"),
+    *("Grid", "GridID", "GridAbsorbingMaterial", "GridSpacingMaterial", "GridThickness"),
+    *("GridPitch", "GridPeriod", "GridAspectRatio", "GridFocalDistance"),
 )
 #: Attributes of DICOM projections that say where a camera is.
 CAMERA_PLACES = (
@@ -103,6 +114,8 @@ DICOM_KEYS = (
         "of views and flat fields; warned of, applied by views.exposure, where others must agree",
     ),
     Key(", ".join(BEAM), "compared", "of views and flat fields; warned of"),
+    Key("ExposureIndex, DeviationIndex", "ignored", "of the grey values, also of the object"),
+    Key("ImageAndFluoroscopyAreaDoseProduct", "ignored", "may be a sum over images"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
     Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
@@ -169,24 +182,14 @@ class ImageFiles(ProjectionStack):
                     )
         self.stated = {
             name: [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
-            for name in COMPARED
+            for name in dict.fromkeys(
+                (*COMPARED, *(key for head in headers for key in head.stated))
+            )
         }
         for name, texts in self.stated.items():
-            stated = {word for text in texts for word in text.split(" or ")} - {""}
-            if len(stated) > 1:
-                own = f"{name} or " if name in exposures.DICOM else ""
-                cure = (
-                    "which the camera must have"
-                    if name in CAMERA_PLACES
-                    else f"for which their grey values are not corrected but by views.exposure="
-                    f"{own}<file> with exposures relative to the flat field's"
-                )
-                warnings.warn(
-                    f"{files[0].parent}: views have several values of {name}, "
-                    f"{' or '.join(sorted(stated)[:3])}, {cure}",
-                    stacklevel=2,
-                )
-        self.files = list(files)
+            cure = "which the camera must have" if name in CAMERA_PLACES else ""
+            exposures.warn_of_several(files[0].parent, name, texts, cure)
+        self.files, self._excluded = list(files), headers[0].excluded
         self.pixel_mm, self._tops = (
             headers[0].pixel_mm,
             frozenset().union(*(head.tops for head in headers)),
@@ -216,6 +219,24 @@ class ImageFiles(ProjectionStack):
                 f"RescaleSlope; give saturation=<grey value> (views.saturation)"
             )
         return next(iter(self._tops))
+
+    @cached_property
+    def marked(self) -> Bool[Tensor, "v u"] | None:
+        """Negative pixels of the first view, where these are no counts.
+
+        Warns:
+            UserWarning: the file states more.
+        """
+        if self._excluded is None:
+            return None
+        marked = torch.from_numpy(self._block(0, 1)[0] < 0)
+        if marked.sum() < self._excluded:
+            warnings.warn(
+                f"{self.path}: expected as many negative pixels as N_excluded_pixels states, "
+                f"{self._excluded}, got {int(marked.sum())}; give the others as views.bad_pixels",
+                stacklevel=2,
+            )
+        return marked
 
     def _block(self, first: int, last: int) -> np.ndarray:
         if len(self.files) == 1:

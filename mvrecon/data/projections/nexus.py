@@ -2,9 +2,11 @@
 2015), Data Exchange (De Carlo and others, J. Synchrotron Rad. 21, 2014), or any data set of frames.
 """
 
+import math
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,13 +31,27 @@ from mvrecon.data.linked import (
 from mvrecon.data.projections import exposures, nexus_axes
 from mvrecon.data.projections.frames import EXPECTED, Frames, FrameViews
 from mvrecon.data.projections.stack import Hdf5Views, ProjectionStack
-from mvrecon.data.storage import held, opened
+from mvrecon.data.storage import check_chunks, dataset_in, held, opened
 
 FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 #: Names of a data set, or of one in another file.
 IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
 #: Frames of views, flat and dark fields by their image_key; others are left out.
 VIEW, FLAT, DARK, INVALID, ALIGNMENT = 0, 1, 2, 3, -1
+#: Data sets of a detector of NeXus, and of an entry, on which grey values depend in a way that is
+#: not stated.
+DETECTOR_BEAM = (
+    *("gain_setting", "threshold_energy", "flatfield_applied", "pixel_mask_applied"),
+    *("countrate_correction_applied", "angular_calibration_applied"),
+)
+BEAM = (
+    *("instrument/beam/incident_energy", "instrument/beam/incident_wavelength"),
+    *("instrument/monochromator/energy", "instrument/source/voltage"),
+)
+#: Of a detector, by whether they are single numbers.
+LIMITS = {"pixel_mask": 0, "sequence_number": 0}
+LIMITS |= dict.fromkeys(("saturation_value", "bit_depth_readout", "underload_value"), 1)
+AXIS = "calibrate=[offset_u] finds the axis"
 #: Data sets of NXtomo and Data Exchange.
 KEYS = (
     Key("image_key", "applied", "0 views, 1 flat fields, 2 dark fields; 3, invalid, left out"),
@@ -75,35 +91,43 @@ KEYS = (
     ),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
     Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
-    Key("pixel_mask, saturation_value", "compared", "views.bad_pixels, saturation; warned of"),
+    Key("pixel_mask", "applied", "bad pixels, all but 0; another size is warned of"),
+    Key("saturation_value, bit_depth_readout", "applied", "the greatest grey value; the first"),
+    Key("underload_value", "compared", "with 0; warned of"),
+    Key("sequence_number", "compared", "with the order of the views; gaps are warned of"),
+    Key(
+        "instrument/<group>/attenuator_transmission",
+        "compared",
+        "as count_time, under this name, with the group's own",
+    ),
+    Key(
+        ", ".join((*DETECTOR_BEAM, *BEAM)),
+        "compared",
+        "of all views and of fields in other files; warned of",
+    ),
+    Key("x_pixel_offset, y_pixel_offset, beam_center_x, beam_center_y", "ignored", AXIS),
     Key(
         "scaling_factor, offset, data_scaling_factor, data_offset",
         "refused",
         "fields beside the data set that they scale; apply them",
         (1, 0),
     ),
-    Key(
-        "field_of_view, estimated_cor_from_motor, x_rotation_axis_pixel_position",
-        "ignored",
-        "calibrate=[offset_u] finds the axis",
-    ),
+    Key("field_of_view, estimated_cor_from_motor, x_rotation_axis_pixel_position", "ignored", AXIS),
     Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
+    Key(
+        "flatfield, dead_time, countrate_correction_lookup_table",
+        "ignored",
+        "the detector's own; flat fields correct unequal pixels",
+    ),
     *nexus_axes.KEYS,
 )
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Units of line integrals.
 LOGARITHMS = re.compile(r"absor|optical.?dens|^od$|attenuation|^ln|log|1/|\^-1", re.IGNORECASE)
-#: Prefixes of units, and the units of exposure times in s and of a beam's current in A; without one
-#: they are these.
-PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
-PREFIXES |= {"milli": 1e-3, "micro": 1e-6, "nano": 1e-9}
-SECONDS, AMPERES = (
-    {"": 1.0, **{start + name: part for start, part in PREFIXES.items() for name in names}}
-    for names in (("s", "sec", "second", "seconds"), ("a", "amp", "ampere", "amperes"))
-)
-SECONDS |= dict.fromkeys(("min", "minute", "minutes"), 60.0)
-SECONDS |= dict.fromkeys(("h", "hour", "hours"), 3600.0)
+#: The type of numbers, and a number as text, with its unit.
+NUMERIC = re.compile(r"(u?int|float|bool)\d*")
+NUMBER = re.compile(r"([-+.\d]+(?:[eE][-+]?\d+)?)\s*(\D*)")
 #: Pixels by which a sample may move between views.
 MAX_MOVE_PX = 0.1
 
@@ -178,6 +202,7 @@ class _Layout(NamedTuple):
     exposures: Sequence[tuple[str, Place]] = ()
     flats: Sequence[tuple[str, Place]] = ()  # exposures of flat fields beside the frames
     moves: Sequence[Place] = ()
+    detector: Place | None = None  # of NXtomo
 
     @property
     def axes(self) -> tuple[str, str, str]:
@@ -249,10 +274,8 @@ class _Layout(NamedTuple):
                     f"views.flip_{option}=true so is the volume",
                     stacklevel=2,
                 )
-        for name, option in (("pixel_mask", "bad_pixels"), ("saturation_value", "saturation")):
-            if (stated := _there(path, f"{group}/{name}")) is not None:
-                warnings.warn(f"{stated}: is not applied; give it as views.{option}", stacklevel=2)
         nexus_axes.warn_of_turned(Place(path, group), EXPECTED)
+        shares = [f"{name}/{exposures.ATTENUATOR}" for name in _members(path, entry, "instrument")]
         key = followed(path, f"{group}/image_key_control", EXPECTED)
         sizes = [
             [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size", "")]
@@ -268,11 +291,15 @@ class _Layout(NamedTuple):
             "parallel" if parallel else None,
             exposures=[
                 (name, place)
-                for above, names in ((group, exposures.DETECTOR), (entry, exposures.MONITORS))
+                for above, names in (
+                    (group, (*exposures.DETECTOR, *DETECTOR_BEAM)),
+                    (entry, (*exposures.MONITORS, *shares, *BEAM)),
+                )
                 for name in names
                 if (place := _there(path, f"{above}/{name}")) is not None
             ],
             moves=[p for axis in "xyz" if (p := first(f"sample/{axis}_translation")) is not None],
+            detector=Place(path, group),
         )
 
     @classmethod
@@ -325,7 +352,7 @@ class _Layout(NamedTuple):
         units = texts_at([*lengths, *monitors], "units", EXPECTED)
         stated = {n: _of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
         fields: dict[str, ProjectionStack] = {
-            name: FrameViews(frames, np.flatnonzero(keys == key), exposures=stated)
+            name: FrameViews(frames, np.flatnonzero(keys == key), stated=stated)
             for name, key in (("flat", FLAT), ("dark", DARK))
             if (keys == key).any()
         }
@@ -335,7 +362,7 @@ class _Layout(NamedTuple):
             of_flats = {
                 n: _of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
             }
-            fields[name] = FrameViews(others, np.arange(len(kind)), exposures=of_flats)
+            fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats)
         unit = texts_at([self.frames], "units", EXPECTED).get(self.frames, "")
         if "flat" in fields and LOGARITHMS.search(unit):
             raise Refused(
@@ -363,7 +390,32 @@ class _Layout(NamedTuple):
                     f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
                     stacklevel=2,
                 )
-        return FrameViews(frames, views, fields, rig, folder, stated)
+        return FrameViews(frames, views, fields, rig, folder, stated, *self._limits(frames, keys))
+
+    def _limits(self, frames: Frames, keys: np.ndarray) -> tuple[np.ndarray | None, float | None]:
+        """Pixels that the detector's mask marks as bad, and its greatest grey value; None of what
+        it does not state. Compares the order of the frames.
+
+        Warns:
+            UserWarning: a mask of another size, other values than one number, an underload.
+        """
+        places = {
+            name: place
+            for name in LIMITS
+            if self.detector is not None
+            and (place := _there(self.detector.path, f"{self.detector.name}/{name}")) is not None
+        }
+        if (place := places.get("sequence_number")) is not None:
+            _check_sequence(place, keys)
+        numbers = {name: _number(place) for name, place in places.items() if LIMITS[name] == 1}
+        if numbers.get("underload_value", 0) > 0:
+            place = places["underload_value"]
+            warnings.warn(f"{place}: is not applied: values below it are wrong", stacklevel=2)
+        top, bits = (numbers.get(name) for name in ("saturation_value", "bit_depth_readout"))
+        if not top and bits and frames.dtype.kind in "iu":
+            top = min(2.0**bits - 1, float(np.iinfo(frames.dtype).max))
+        place = places.get("pixel_mask")
+        return None if place is None else _mask(place, frames.shape[1:]), top or None
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
         """Rows' and columns' pitch; None if the file has none with units."""
@@ -390,6 +442,86 @@ def _there(path: Path, name: str) -> Place | None:
         return None
 
 
+def _members(path: Path, entry: str, name: str) -> list[str]:
+    """The names of what is in a group of an entry, behind that of the group."""
+    if (place := _there(path, f"{entry}/{name}")) is None:
+        return []
+    with opened(place.path, EXPECTED) as file:
+        group: Any = file[place.name]
+        return [f"{name}/{inner}" for inner in group] if isinstance(group, h5py.Group) else []
+
+
+def _number(place: Place) -> float:
+    """A number of a detector; 0 of another one, with a warning."""
+    with _unneeded():
+        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+        if len(values) != 1 or not np.isfinite(values[0]):
+            raise Refused(f"{place}: expected one number, got {shown(values.tolist())}")
+        return float(values[0])
+    return 0.0
+
+
+def _mask(place: Place, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Bad pixels by a detector's mask [v u]; None of another one, with a warning."""
+    with _unneeded("; give it as views.bad_pixels"), opened(place.path, EXPECTED) as file:
+        stored = dataset_in(place.path, file, place.name, EXPECTED)
+        if stored.dtype.kind not in "biu" or (*stored.shape[-2:], stored.size) != (
+            *shape,
+            math.prod(shape),
+        ):
+            got = f"{stored.dtype} {stored.shape}"
+            raise Refused(f"{place}: expected a mask of {shape} pixels, got {got}")
+        check_chunks(place.path, stored)
+        return stored[()].reshape(shape) != 0
+    return None
+
+
+@contextmanager
+def _unneeded(cure: str = "") -> Iterator[None]:
+    """Warn of what is refused within, instead of raising, as the views do not need it."""
+    try:
+        yield
+    except Refused as error:
+        warnings.warn(f"{error}; it is not used{cure}", stacklevel=4)
+
+
+def _check_sequence(place: Place, keys: np.ndarray) -> None:
+    """Compare the sequence numbers of frames, counted for all or for each kind, with their order.
+
+    Warns:
+        UserWarning: frames between views are missing, or another number of numbers.
+
+    Raises:
+        Refused: views are not in the order of their numbers.
+    """
+    numbers, views = values_at(place, EXPECTED, ("units",)).ravel(), np.flatnonzero(keys == VIEW)
+    if len(numbers) not in (len(keys), len(views)):
+        warnings.warn(
+            f"{place}: expected a number of each of {len(keys)} frames or {len(views)} views, got "
+            f"{len(numbers)}, which are not used",
+            stacklevel=2,
+        )
+        return
+    own = (numbers[views] if len(numbers) == len(keys) else numbers).astype(float)
+    steps, apart = np.diff(own), np.diff(views)
+    if not steps.any():  # never filled
+        return
+    if (steps <= 0).any():
+        first = int(np.argmax(steps <= 0))
+        raise Refused(
+            f"{place}: expected views in the order of their sequence numbers, got "
+            f"{own[first]:g} and then {own[first + 1]:g}; sort frames and angles by them"
+        )
+    least = (steps[apart == 1] if (apart == 1).any() else steps).min()
+    if (gaps := (steps != least) & (steps != least * apart)).any():
+        first = int(np.argmax(gaps))
+        warnings.warn(
+            f"{place}: {gaps.sum()} gaps between views, such as from {own[first]:g} to "
+            f"{own[first + 1]:g}: frames were dropped, and angles must be those of the others",
+            stacklevel=2,
+        )
+
+
 def _flat_time(path: Path) -> Place | None:
     """The exposure time of Data Exchange's flat fields, where it is not that of the views."""
     above = "/process/acquisition/flat_fields"
@@ -402,37 +534,27 @@ def _flat_time(path: Path) -> Place | None:
 
 
 def _of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarray:
-    """An exposure of each frame in s or A, of one number for all, one of each frame, or one of each
-    view; NaN of frames without one.
+    """What a file states of each frame by a name, as texts: an exposure in s or A, or a property of
+    the beam; of one value for all, one of each frame, or one of each view; "" of frames without.
 
     Warns:
-        UserWarning: another number of them, or a time or current of an unknown unit; views that
-            differ where flat fields state none.
+        UserWarning: no numbers of an exposure, another number of them, or a time or current of an
+            unknown unit; views that differ where flat fields state none.
     """
-    values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
-    known = SECONDS if exposures.KINDS[name] == "time" else AMPERES if "current" in name else {}
-    factor = known.get(unit.strip().lower()) if known else 1.0
-    if factor is None:
-        such = "s or ms" if known is SECONDS else "A or mA"
-        warnings.warn(
-            f"{place}: expected the {name} in units such as {such}, got {shown(unit)}; it is not "
-            f"used",
-            stacklevel=2,
-        )
-        return np.full(len(keys), np.nan)
-    values *= factor
-    stated, views = np.full(len(keys), np.nan), keys == VIEW
-    if len(values) in (1, len(keys)):
-        stated[:] = values
-    elif len(values) == views.sum():
-        stated[views] = values
-    else:
-        warnings.warn(
-            f"{place}: expected one {name}, or one of each of {len(keys)} frames or {views.sum()} "
-            f"views, got {len(values)}, which are not used",
-            stacklevel=2,
-        )
-    own, flats = stated[views & np.isfinite(stated)], stated[keys == FLAT]
+    stated, views = np.full(len(keys), "", object), keys == VIEW
+    texts: list[str] = []
+    with _unneeded():
+        texts = _texts_of(name, place, unit)
+        if len(texts) not in (1, len(keys), views.sum()):
+            raise Refused(
+                f"{place}: expected one {name}, or one of each of {len(keys)} frames or "
+                f"{views.sum()} views, got {len(texts)}"
+            )
+        stated[views if len(texts) == views.sum() else slice(None)] = texts
+    if exposures.kind_of(name) == "beam":
+        exposures.warn_of_several(place.path, name, stated[views])
+        return stated
+    own, flats = (np.array([float(t) for t in stated[w] if t]) for w in (views, keys == FLAT))
     changes = len(own) and np.ptp(own) > exposures.MAX_CHANGE * abs(own.mean())
     if changes and not (len(flats) and (flats > 0).all()):
         warnings.warn(
@@ -441,3 +563,25 @@ def _of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarr
             stacklevel=2,
         )
     return stated
+
+
+def _texts_of(name: str, place: Place, unit: str) -> list[str]:
+    """What a data set states, as texts; "" of what is not finite, or of an unknown unit.
+
+    Raises:
+        Refused: an exposure that is no number, or many texts.
+    """
+    text = texts_at([place], "", EXPECTED).get(place, "").strip()  # or the type of numbers
+    beam, number = exposures.kind_of(name) == "beam", NUMBER.fullmatch(text)
+    if beam and not NUMERIC.fullmatch(text):
+        if re.fullmatch(r"object|\|S\d+", text):  # texts of each frame
+            raise Refused(f"{place}: expected one {name} of all frames, got many texts")
+        return [text]
+    if number:
+        values, unit = np.array([float(number[1])]), number[2] or unit
+    else:
+        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+    if not beam:
+        values = exposures.in_base_units(values, name, unit, place)
+    end = f" {unit}".rstrip() if beam else ""
+    return [f"{x:.12g}{end}" if np.isfinite(x) else "" for x in values]

@@ -10,8 +10,17 @@ from pathlib import Path
 
 from mvrecon.core.files.checks import Refused, shown
 
-#: A number in a name: a decimal such as 0.25, but not part of 1.2.3; and an integer.
-DECIMAL, INTEGER = r"(?<![0-9.])[0-9]+\.[0-9]+(?![0-9.])", "[0-9]+"
+#: A number in a name: a decimal such as 0.25, or .5 behind a separator, but not part of 1.2.3; and
+#: an integer.
+DECIMAL = r"(?:(?<![0-9.])[0-9]+|(?<![^-+_ =]))\.[0-9]+(?![0-9.])"
+INTEGER = "[0-9]+"
+#: A number with an exponent, 5e-1 or 1.5e2; and one that may be two numbers, 1e2.
+SCIENTIFIC = r"(?<![0-9.])(?:[0-9]+(?:\.[0-9]+)?e[-+]|[0-9]+\.[0-9]+e)[0-9]{1,3}(?![0-9.a-z])"
+EXPONENT = r"(?<![0-9.])[0-9]+e[0-9]{1,3}(?![0-9.a-z])"
+#: A decimal with a comma, which may be two numbers.
+COMMA = r"(?<![0-9.,])[0-9]+,[0-9]+(?![0-9.,])"
+#: A separator and a minus before a number, which is a sign.
+NEGATIVE = re.compile(r"[^a-z0-9]-$")
 
 
 def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> list[Path]:
@@ -24,27 +33,41 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
         mixed: allow several kinds of names, as chosen on purpose.
 
     Warns:
-        UserWarning: names that differ in more than their numbers; they are sorted as text.
+        UserWarning: names that differ in more than their numbers; they are sorted as text. Or all
+            numbers are negative.
 
     Raises:
-        Refused: two names with the same numbers, a missing number, or several kinds of names, one
-            of which is numbered: some may be references or previews.
+        Refused: two names with the same numbers, a missing number, numbers that may be read in two
+            ways of another order (1e2, 0,5), or several kinds of names, one of which is numbered:
+            some may be references or previews.
     """
     if len(paths) < 2:
         return list(paths)
+    where, stems = paths[0].parent, [re.sub(SCIENTIFIC, "x", path.stem.lower()) for path in paths]
     # integers only if "1.9" is followed by "1.10", a smaller decimal
-    decimals = [text for path in paths for text in re.findall(DECIMAL, path.stem)]
+    decimals = [text for stem in stems for text in re.findall(DECIMAL, stem)]
     places = [text.partition(".")[2] for text in decimals]
     counted = any(len(part) > 1 and part.endswith("0") for part in places)
     number = INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
-    parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
-    _move_signs(list(parts.values()))
-    keys = {
-        path: [Decimal(text) if k % 2 else text for k, text in enumerate(part)]
-        for path, part in parts.items()
-    }
-    files = sorted(paths, key=lambda path: (keys[path], path.name))
-    where = files[0].parent
+    mixed_up = any(re.search(SCIENTIFIC, path.stem.lower()) for path in paths)  # 1e-1 and 1e0
+    number = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}{number}"
+    files, parts, keys = _sorted(paths, number)
+    for other in (EXPONENT, COMMA):
+        if _sorted(paths, f"{other}|{number}")[0] != files:
+            such = next(
+                found[0] for path in files if (found := re.search(other, path.stem.lower()))
+            )
+            raise Refused(
+                f"{where}: expected names whose numbers can be read in one way, got {such}, which "
+                f"may be one number or two, in another order; rename the files"
+            )
+    columns = zip(*(part[1::2] for part in parts.values()), strict=False)
+    if any(len({*texts}) > 1 and all(text[0] == "-" for text in texts) for texts in columns):
+        warnings.warn(
+            f"{where}: the numbers in the names of all views are taken to be negative: "
+            f"{files[0].name}, {files[1].name}, ...",
+            stacklevel=2,
+        )
     words: dict[tuple[str, ...], list[Path]] = {}
     for path in files:
         words.setdefault(tuple(parts[path][::2]), []).append(path)
@@ -75,15 +98,36 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     return files
 
 
+def _sorted(
+    paths: Sequence[Path], number: str
+) -> tuple[list[Path], dict[Path, list[str]], dict[Path, list[str | Decimal]]]:
+    """Files by the numbers in their names, the words and numbers of each name, and as sorted.
+
+    Args:
+        paths: of the files.
+        number: pattern of numbers.
+    """
+    parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
+    _move_signs(list(parts.values()))
+    keys = {
+        path: [Decimal(text.replace(",", ".")) if k % 2 else text for k, text in enumerate(part)]
+        for path, part in parts.items()
+    }
+    return sorted(paths, key=lambda path: (keys[path], path.name)), parts, keys
+
+
 def _move_signs(parts: Sequence[list[str]]) -> None:
     """Move the + or - before a number to it, where some names have it and others do not, or
-    another: in tilt_-10 and tilt_0 it is a sign, in scan-001 and scan-002 a dash.
+    another, or where a separator comes before it: in tilt_-10 and tilt_0 it is a sign, and in
+    tilt_-10 and tilt_-20; in scan-001 and scan-002 a dash.
     """
     if len({len(part) for part in parts}) > 1:
         return
     for k in range(0, len(parts[0]) - 1, 2):
         words = {part[k] for part in parts}
-        if len(words) > 1 and len({re.sub("[-+]$", "", word) for word in words}) == 1:
+        signs = len(words) > 1 and len({re.sub("[-+]$", "", word) for word in words}) == 1
+        negative = all(NEGATIVE.search(word) or word == "-" and k == 0 for word in words)
+        if signs or (negative and len({part[k + 1] for part in parts}) > 1):
             for part in (part for part in parts if part[k][-1:] in ("+", "-")):
                 part[k], part[k + 1] = part[k][:-1], part[k][-1] + part[k + 1]
 

@@ -33,6 +33,8 @@ EDF_TYPES = {
     **{"signedbyte": "i1", "signedshort": "i2", "signedinteger": "i4", "signedlong": "i4"},
     **{"float": "f4", "floatvalue": "f4", "double": "f8", "doublevalue": "f8"},
 }
+#: Exposure times in s by their names in EDF.
+EDF_TIMES = ("count_time", "ExposureTime", "acq_expo_time")
 EDF_KEYS = (
     Key("Dim_1, Dim_2", "applied"),
     Key("ByteOrder", "applied"),
@@ -42,6 +44,9 @@ EDF_KEYS = (
     Key("EDF_BinaryFileName", "refused", "values behind the header"),
     Key("RasterConfiguration", "refused", "rows from the first pixel", (1,)),
     Key("DataValueOffset", "refused", "add it to the values", (0,)),
+    Key("Dummy", "refused", "its pixels are bad: replace them, and give views.bad_pixels"),
+    Key(", ".join(EDF_TIMES), "compared", "of views and flat fields, as ExposureTime, from s"),
+    Key("counter_mne, counter_pos", "compared", "the ring's current srcur, as ExposureTime"),
     Key("optic_used", "ignored", "of no stated unit; the pixel size is asked for"),
 )
 HIS_KEYS = (
@@ -78,7 +83,13 @@ def rtk_header(file: Path) -> Header:
     """
     form = ENDINGS[file.suffix.lower()]
     kind, sized = PIXELS[form]
-    kind = _checked(file, form) or kind
+    stated: dict[str, list[str]] = {}
+    if form == "EDF":
+        kind, stated = _check_edf(file)
+    elif form == "HIS":
+        _check_his(file)
+    elif form == "XIM":
+        _check_xim(file)
     reader = _reader(file)
     reader.UpdateOutputInformation()
     columns, rows, pages = size = tuple(reader.GetOutput().GetLargestPossibleRegion().GetSize())
@@ -95,7 +106,7 @@ def rtk_header(file: Path) -> Header:
     dtype = np.dtype(kind)
     top = None if dtype.kind == "f" else float(np.iinfo(dtype).max)
     pixel = (down, right) if sized else None
-    return Header((rows, columns), dtype, pages, frozenset([top]), pixel)
+    return Header((rows, columns), dtype, pages, frozenset([top]), pixel, stated=stated)
 
 
 def rtk_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
@@ -124,18 +135,8 @@ def _itk(file: Path) -> Any:
     return itk
 
 
-def _checked(file: Path, form: str) -> str:
-    """Check what RTK's reader takes for granted; return the type of the pixels of an EDF."""
-    if form == "EDF":
-        return _check_edf(file)
-    if form == "HIS":
-        _check_his(file)
-    elif form == "XIM":
-        _check_xim(file)
-    return ""
-
-
-def _check_edf(file: Path) -> str:
+def _check_edf(file: Path) -> tuple[str, dict[str, list[str]]]:
+    """The type of the pixels, and what the header states of the exposure."""
     with file.open("rb") as raw:
         text = raw.read(EDF_HEADER)
     ends = [n for n in range(EDF_BLOCK, len(text) + 1, EDF_BLOCK) if text[n - 2 : n] == b"}\n"]
@@ -154,7 +155,13 @@ def _check_edf(file: Path) -> str:
         raise Refused(
             f"{file}: expected one image of {needed} bytes, got {needed + behind} behind the header"
         )
-    return kind
+    counters = dict(
+        zip(*(stated.get(f"counter_{end}", "").split() for end in ("mne", "pos")), strict=False)
+    )
+    times = {stated[name.lower()] for name in EDF_TIMES if stated.get(name.lower())}
+    exposed = {f"{1000 * float(t):.6g}" for t in times if re.fullmatch(r"[-+.\deE]+", t)}
+    texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
+    return kind, {name: [text] for name, text in texts.items() if text}
 
 
 def _check_his(file: Path) -> None:

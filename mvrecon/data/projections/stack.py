@@ -38,7 +38,8 @@ class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
     these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
     have in common, those on which grey values or places depend, by their names a text for each
-    page, and whether values are stated to be in proportion to intensity.
+    page, whether values are stated to be in proportion to intensity, and, where negative values
+    mark bad pixels, how many of these the file states.
     """
 
     shape: tuple[int, int]
@@ -49,6 +50,7 @@ class Header(NamedTuple):
     alike: tuple[Any, ...] = ()
     stated: Mapping[str, Sequence[str]] = {}
     linear: bool = False
+    excluded: int | None = None
 
     @property
     def words(self) -> str:
@@ -128,6 +130,11 @@ class ProjectionStack(ABC):
     def top(self) -> float | None:
         """Greatest grey value of the pixels' integer type; none for floats."""
         return None if self.dtype.kind == "f" else float(np.iinfo(self.dtype).max)
+
+    @property
+    def marked(self) -> Bool[Tensor, "v u"] | None:
+        """Pixels that the files mark as bad; None if they mark none."""
+        return None
 
     def exposure(self, *names: str) -> Float[np.ndarray, " m"] | None:
         """The product of what files state of each view by names; None unless all are numbers."""

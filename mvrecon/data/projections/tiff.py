@@ -12,8 +12,11 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, shown
 from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import VIEWS, Header
 
+#: Tags of EXIF on which grey values depend, but not in a proportion that all cameras share.
+EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureBiasValue")
 #: Tags of TIFF that change the pixels or their order.
 TIFF_KEYS = (
     Key("BitsPerSample", "applied", "also gives the largest grey value"),
@@ -51,6 +54,7 @@ TIFF_KEYS = (
         "compared",
         "of all views, also in EXIF, in ms as in DICOM; warned of, applied by views.exposure",
     ),
+    Key(", ".join(EXIF_BEAM), "compared", "of views and flat fields, also in EXIF; warned of"),
     Key("Decode", "refused", "store the values of its range"),
     Key("StoNits", "refused", "store the values that the factor gives", (1,)),
     Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
@@ -88,6 +92,7 @@ TIFF_KEYS = (
         "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
     ),
     Key("BaselineExposure", "ignored", "of the display"),
+    *descriptions.KEYS,
 )
 
 
@@ -100,11 +105,11 @@ def tiff_header(file: Path) -> Header:
                 f"{file}: expected as many pages as its description states images, {images}, "
                 f"got {len(pages)}; save the stack as an image sequence"
             )
-        first, numbers, exposed = _page_header(file, pages[0], images), [], []
+        first, numbers, stated = _page_header(file, pages[0], images), [], []
         for page in pages:
             _check_tags(file, page)
             head = _page_header(file, page, images)
-            exposed += head.stated["ExposureTime"]
+            stated.append({name: texts[0] for name, texts in head.stated.items()})
             if head._replace(stated=first.stated) != first:
                 raise Refused(
                     f"{file}: expected {first.words} on every page, got {head.words} on page "
@@ -112,8 +117,11 @@ def tiff_header(file: Path) -> Header:
                 )
             numbers.append(page.tags.valueof("PageNumber"))
         _check_order(file, pages[0].description, numbers, images)
-        exposed *= images // len(pages)
-        first = first._replace(stated={"ExposureTime": exposed})
+        stated *= images // len(pages)
+        names = dict.fromkeys(name for one in stated for name in one)
+        texts = {name: [one.get(name, "") for one in stated] for name in names}
+        head = first._replace(stated=texts)
+        first = descriptions.of_file(file, head, pages[0].description)
     if _offset(pages[0]):
         return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return first
@@ -150,9 +158,6 @@ def _offset(page: Any) -> bool:
 #: Axes of a stack by ImageJ's description, and by OME's.
 AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d+)\"", re.MULTILINE)
 
-#: The page of an image of OME, and its place along the axes.
-PLANE = re.compile(r"\b(IFD|First[CZT])=\"(\d+)\"")
-
 
 def _behind(pages: Any, images: int) -> bool:
     """Whether plain images follow the one of a single page without pages of their own, as in
@@ -173,7 +178,7 @@ def _check_order(
     known = [number[0] for number in numbers if number]
     if known != sorted(known):
         raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
-    if not ("ImageJ" in text or "<OME" in text):
+    if not ("ImageJ" in text or descriptions.OME.search(text)):
         return
     axes = [(a or c, int(b or d)) for a, b, c, d in AXES.findall(text)]
     running = [f"{name} {size}" for name, size in axes if size > 1]
@@ -187,9 +192,11 @@ def _check_order(
             f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
             f"{images}; are the others in further files?"
         )
-    places = [dict(PLANE.findall(plane)) for plane in re.findall("<TiffData[^>]*>", text)]
-    planes = sorted((int(place.pop("IFD", 0)), sum(map(int, place.values()))) for place in places)
-    if "<OME" in text and planes != sorted(planes, key=lambda plane: plane[1]):
+    planes = sorted(
+        (int(place.get("IFD", 0)), sum(int(place.get(f"First{axis}", 0)) for axis in "ZCT"))
+        for place in descriptions.elements(text, "TiffData")
+    )
+    if planes != sorted(planes, key=lambda plane: plane[1]):
         raise Refused(
             f"{file}: expected pages in the order of TiffData in its ImageDescription, got the "
             f"images {shown([image for _, image in planes])}; sort the pages, and save them again"
@@ -226,9 +233,14 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
     exif = page.tags.valueof("ExifTag") or {}
     exposed = (page.tags.valueof("ExposureTime"), exif.get("ExposureTime"))
     ratios = [s if isinstance(s, tuple) else (s, 1) for s in exposed if s is not None]
-    times = {f"{1000 * s / unit:.6g}" for s, unit in ratios if unit}  # in ms, as in DICOM
+    times = {descriptions.milliseconds(file, s / unit, "s") for s, unit in ratios if unit}
     stated = {"ExposureTime": [" or ".join(sorted(times))]}
-    return Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
+    for name in EXIF_BEAM:
+        if (value := exif.get(name, page.tags.valueof(name))) is not None:
+            stated[name] = [str(value)]
+    head = Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
+    manager = page.tags.valueof("MicroManagerMetadata")
+    return descriptions.of_page(file, head, page.description, manager)
 
 
 def tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:

@@ -69,7 +69,8 @@ class Measured:
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
             their neighbours, and not in the mask.
         bad_pixels: mask of pixels that measure wrongly, 0 good and 1 bad: an image or a .npy of the
-            views' size on disk. They are filled and not in the mask, as dead ones.
+            views' size on disk. They are filled and not in the mask, as dead ones; so are those
+            that the files mark as bad.
         find_bad_pixels: also find dead, hot and stuck pixels by the views themselves, and single
             bright ones (zingers) in each view, of grey values and of other programs' integrals.
         rings: remove the rings of pixels that measure unequally, which reads all views first:
@@ -430,8 +431,10 @@ class MeasuredViews:
             self.region.columns,
         )
         bad = torch.zeros(bottom - top, right - left, dtype=torch.bool)
+        if (marked := self.stack.marked) is not None:
+            bad = self._kept(marked)
         if self.options.bad_pixels is not None:
-            bad = self._kept(bad_pixels(self.options.bad_pixels, self.stack.shape))
+            bad = bad | self._kept(bad_pixels(self.options.bad_pixels, self.stack.shape))
         if self.kind == "intensities":
             bad = bad | ~self.fields.alive
         if self._finds and not bad.all():

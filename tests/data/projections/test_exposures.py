@@ -151,6 +151,26 @@ def test_exposures_of_nexus_are_applied_by_their_name(name, tmp_path):
         ({"ExposureTime": 40}, {"ExposureTime": 20}, "ExposureTime 20, its views have 40"),
         ({"XRayTubeCurrent": 9}, {"XRayTubeCurrent": 18}, "XRayTubeCurrent 18, its views have 9"),
         ({"KVP": 80}, {"KVP": 120}, "KVP 120.0, its views have 80.0"),
+        (
+            {"RelativeXRayExposure": 100},
+            {"RelativeXRayExposure": 200},
+            "RelativeXRayExposure 200, its views have 100",
+        ),
+        ({"EntranceDose": 10}, {"EntranceDose": 20}, "EntranceDose 20, its views have 10"),
+        (
+            {"FrameAcquisitionDuration": 10.0},
+            {"FrameAcquisitionDuration": 20.0},
+            "FrameAcquisitionDuration 20, its views have 10",
+        ),
+        ({"Grid": "FIXED"}, {"Grid": "NONE"}, "Grid NONE, its views have FIXED"),
+        (
+            {"Grid": ["FIXED", "FOCUSED"], "GridAbsorbingMaterial": "LEAD"},
+            {"Grid": ["FIXED", "FOCUSED"], "GridAbsorbingMaterial": "TUNGSTEN"},
+            "GridAbsorbingMaterial TUNGSTEN, its views have LEAD",
+        ),
+        ({"GridPitch": 0.2}, {"GridPitch": 0.4}, "GridPitch 0.4, its views have 0.2"),
+        ({"DetectorMode": "LOW"}, {"DetectorMode": "HIGH"}, "DetectorMode HIGH, its views have"),
+        ({"HalfValueLayer": "3"}, {"HalfValueLayer": "9"}, "HalfValueLayer 9, its views have 3"),
         ({"Exposure": 4}, {"Exposure": 4}, None),
         ({"Exposure": 4}, {}, None),
     ],
@@ -313,6 +333,30 @@ CONTRADICT = {
         {"ExposureTime": 40, "NumberOfFramesIntegrated": 4},
         {"ExposureTime": 40, "NumberOfFramesIntegrated": 16},
         "ExposureTime*NumberOfFramesIntegrated",
+    ),
+    "another entrance dose": (
+        "ExposureTime",
+        {"ExposureTime": 40, "EntranceDoseInmGy": 1.5},
+        {"ExposureTime": 40, "EntranceDoseInmGy": 3.0},
+        "EntranceDoseInmGy",
+    ),
+    "an entrance dose in dGy": (
+        "ExposureTime",
+        {"ExposureTime": 40, "EntranceDoseInmGy": 3000.0},
+        {"ExposureTime": 40, "EntranceDose": 60},
+        "EntranceDoseInmGy",
+    ),
+    "another relative exposure": (
+        "ExposureTime",
+        {"ExposureTime": 40, "RelativeXRayExposure": 100},
+        {"ExposureTime": 40, "RelativeXRayExposure": 300},
+        "ExposureTime*RelativeXRayExposure",
+    ),
+    "frames of another duration": (
+        "ExposureTime",
+        {"ExposureTime": 40, "FrameAcquisitionDuration": 40.0},
+        {"ExposureTime": 40, "FrameAcquisitionDuration": 80.0},
+        "ExposureTime*FrameAcquisitionDuration",
     ),
     "pulses": (
         "ExposureTime",
@@ -498,6 +542,24 @@ def test_flat_fields_of_another_exposure_in_data_exchange(differs, tmp_path):
     np.testing.assert_allclose(found, plain + (0 if same else np.log(2)), atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("name", "own", "other"),
+    [
+        ("RelativeXRayExposure", 100, 200),
+        ("EntranceDoseInmGy", 1.5, 3.0),
+        ("FrameAcquisitionDuration", 10.0, 20.0),
+        ("Grid", "FIXED", "NONE"),
+        ("GridThickness", 2.0, 3.0),
+    ],
+)
+def test_views_of_several_doses_or_grids_are_warned_of(name, own, other, tmp_path):
+    for k in range(3):
+        tags = {"InstanceNumber": k, name: other if k == 2 else own}
+        dicom_image(tmp_path / f"v_{k}.dcm", np.full((4, 6), 9, "u2"), **tags)
+    with pytest.warns(UserWarning, match=f"views have several values of {name}"):
+        opened(tmp_path, flat=20.0, find_bad_pixels=False)
+
+
 @pytest.mark.filterwarnings("ignore:.*several values")
 def test_exposure_times_of_tiff_are_applied_by_their_name(tmp_path):
     """Of EXIF's tags, in files of their own; those of the pages of one file as well."""
@@ -561,6 +623,116 @@ def test_times_of_one_file_are_compared_in_one_unit(unit, tmp_path):
             file[name].attrs["units"] = text
     found = opened(path, exposure="exposure_time", find_bad_pixels=False).whole().views
     np.testing.assert_allclose(found, plain + np.log(2), atol=1e-5)
+
+
+ATTENUATED = np.where(KEYS == 1, 0.5, 1.0)
+SHARES = ("instrument/attenuator", "instrument/filter_2")
+
+
+@pytest.mark.parametrize("where", SHARES)
+def test_attenuators_of_nexus_are_applied_by_their_name(where, tmp_path):
+    """A flat field behind an attenuator is warned of; a time without it is refused, with their
+    product.
+    """
+    name = f"{where}/attenuator_transmission"
+    path = monitored(tmp_path / "a.nxs", {name: ATTENUATED, "count_time": FLAT_OF})
+    plain = opened(tomo(tmp_path / "b.nxs"), find_bad_pixels=False).whole().views.numpy()
+    with pytest.warns(UserWarning, match=f"the flat field has the {name} 0.5, its views have 1"):
+        opened(path, find_bad_pixels=False)
+    with pytest.raises(Refused, match=rf"views.exposure=count_time\*{name} if light"):
+        opened(path, exposure="count_time", find_bad_pixels=False)
+    found = opened(path, exposure=f"count_time * {name}", find_bad_pixels=False).whole().views
+    np.testing.assert_allclose(found.numpy(), plain + np.log(4), atol=1e-5)
+
+
+def test_two_attenuators_multiply_the_light(tmp_path):
+    one, two = (f"{where}/attenuator_transmission" for where in SHARES)
+    path = monitored(tmp_path / "a.nxs", {one: ATTENUATED, two: np.where(KEYS == 1, 1.0, 0.2)})
+    with pytest.raises(Refused, match=re.escape(f"views.exposure={one}*{two} if light")):
+        opened(path, exposure=one, find_bad_pixels=False)
+    plain = opened(tomo(tmp_path / "b.nxs"), find_bad_pixels=False).whole().views.numpy()
+    found = opened(path, exposure=f"{two}*{one}", find_bad_pixels=False).whole().views
+    np.testing.assert_allclose(found.numpy(), plain + np.log(0.4), atol=1e-5)
+
+
+BEAMS = {
+    "gain_setting": ("high", "low"),
+    "threshold_energy": (6000.0, 9000.0),
+    "flatfield_applied": (True, False),
+    "countrate_correction_applied": (1, 0),
+    "pixel_mask_applied": (np.bool_(True), np.bool_(False)),
+    "instrument/beam/incident_energy": (25.0, 30.0),
+    "instrument/source/voltage": (80.0, 120.0),
+}
+
+
+@pytest.mark.parametrize("name", BEAMS)
+def test_other_settings_of_nexus_are_warned_of(name, tmp_path):
+    """Of fields in another file, and of views among themselves."""
+    own, other = BEAMS[name]
+    place = (name if "/" in name else f"instrument/detector/{name}").replace("/", "__")
+    views, same, flats = (
+        tomo(tmp_path / f"{k}.nxs", **{place: value}) for k, value in enumerate((own, own, other))
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened(views, flat=same, find_bad_pixels=False)
+    with pytest.warns(UserWarning, match=f"2.nxs: the flat field has the {name} "):
+        opened(views, flat=flats, find_bad_pixels=False)
+    if not isinstance(own, str):
+        several = np.where(np.arange(len(KEYS)) < 9, own, other)
+        with pytest.warns(UserWarning, match=f"views have several values of {name}"):
+            opened(tomo(tmp_path / "3.nxs", **{place: several}), find_bad_pixels=False)
+
+
+@pytest.mark.parametrize("kind", ["S4", h5py.string_dtype()])
+def test_settings_of_nexus_as_a_text_of_each_frame_are_warned_of(kind, tmp_path):
+    """They are not compared."""
+    texts = np.array([b"high", b"low"] * len(KEYS))[: len(KEYS)].astype(kind)
+    path = tomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        file.create_dataset("entry/instrument/detector/gain_setting", data=texts, dtype=kind)
+    with pytest.warns(UserWarning, match="gain_setting: expected one .* it is not used"):
+        opened(path, find_bad_pixels=False)
+
+
+TEXTS = {
+    "a number": ("0.1", 2),
+    "in s": ("0.1 s", 2),
+    "in ms": (b"100 ms", 2),
+    "none": ("unknown", None),
+    "several": (np.array([b"0.1", b"0.1"]), None),
+    "two numbers": ([0.1, 0.2], None),
+    "nothing": (h5py.Empty("f8"), None),
+}
+
+
+@pytest.mark.parametrize("case", TEXTS)
+@pytest.mark.parametrize("layout", ["Data Exchange", "NXtomo"])
+def test_exposure_times_as_texts_do_not_refuse_a_file_that_does_not_need_them(
+    layout, case, tmp_path
+):
+    """Of the views; a text that is a number is one. Needed, what is none is refused by name."""
+    value, ratio = TEXTS[case]
+    if layout == "NXtomo":
+        path, name = monitored(tmp_path / "a.h5", {"count_time": value}), "count_time"
+        flat = monitored(tmp_path / "b.h5", {"count_time": 0.05})
+    else:
+        path, name, flat = exchange(tmp_path / "a.h5"), "exposure_time", None
+        with h5py.File(path, "a") as file:
+            file[f"measurement/instrument/detector/{name}"] = value
+            file["process/acquisition/flat_fields/flat_exposure_time"] = 0.05
+    options = {"flat": flat, "find_bad_pixels": False}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        plain = opened(path, **options).whole().views
+    assert any("it is not used" in str(one.message) for one in caught) is (ratio is None)
+    if ratio is None:
+        with pytest.raises(FileNotFoundError, match=f"{name}.*each view states no exposure"):
+            opened(path, exposure=name, **options)
+    else:
+        found = opened(path, exposure=name, **options).whole().views
+        np.testing.assert_allclose(found, plain + np.log(ratio), atol=1e-5)
 
 
 @pytest.mark.parametrize("unit", ["m", "frames", "1e-3 s", "mA"])

@@ -620,12 +620,95 @@ def test_a_detector_that_is_turned_is_warned_of(name, kind, warned, tmp_path):
     assert [words in str(one.message) for one in caught] == [True] * warned
 
 
-@pytest.mark.parametrize(
-    ("name", "option"), [("pixel_mask", "bad_pixels"), ("saturation_value", "saturation")]
-)
-def test_pixels_that_a_detector_excludes_are_warned_of(name, option, tmp_path):
-    with pytest.warns(UserWarning, match=f"{name}: is not applied; give it as views.{option}"):
-        opened(tomo(tmp_path / "a.nxs", **{f"instrument__detector__{name}": np.ones((6, 8))}))
+@pytest.mark.parametrize("form", ["uint32", "bool", "one frame", "a frame more", "floats"])
+def test_pixels_of_a_detectors_mask_are_left_out(form, tmp_path):
+    """Whatever bit is set; those of a mask that is none of the frames' pixels are warned of."""
+    mask = np.zeros((ROWS, COLUMNS), "u4")
+    mask[1, 2], mask[4, 7] = 1, 256
+    if form in ("bool", "floats"):
+        mask = mask.astype("f4" if form == "floats" else bool)
+    mask = np.stack([mask] * {"one frame": 1, "a frame more": 2}.get(form, 0) or [mask]).squeeze(
+        0 if form in ("uint32", "bool", "floats") else ()
+    )
+    path = tomo(tmp_path / "a.nxs", instrument__detector__pixel_mask=mask)
+    if form in ("a frame more", "floats"):
+        with pytest.warns(UserWarning, match="expected a mask of .*give it as views.bad_pixels"):
+            assert opened(path, find_bad_pixels=False).whole().mask.all()
+        return
+    with pytest.warns(UserWarning, match="2 of 48 pixels are dead, hot or stuck"):
+        found = opened(path, find_bad_pixels=False).whole()
+    good = torch.from_numpy(mask == 0).reshape(ROWS, COLUMNS)
+    assert torch.equal(found.mask, good.expand(VIEWS, ROWS, COLUMNS))
+    expected = torch.from_numpy(integrals()).float()
+    assert torch.allclose(found.views[:, good], expected[:, good], atol=2e-6)
+
+
+SATURATION = {
+    "a value": ({"saturation_value": 40_000}, 40_000),
+    "a value in an array": ({"saturation_value": [[40_000.0]]}, 40_000),
+    "bits": ({"bit_depth_readout": 15}, 2**15 - 1),
+    "bits of the type": ({"bit_depth_readout": 32}, 65535),
+    "both": ({"saturation_value": 40_000, "bit_depth_readout": 15}, 40_000),
+    "never filled": ({"saturation_value": 0, "bit_depth_readout": 0}, 65535),
+    "NaN": ({"saturation_value": np.nan}, 65535),
+    "a text": ({"saturation_value": "none"}, 65535),
+}
+
+
+@pytest.mark.parametrize("case", SATURATION)
+def test_the_saturation_that_a_detector_states_is_applied(case, tmp_path):
+    """Half of the grey values of `grey` are above 24 500."""
+    sets, top = SATURATION[case]
+    path = tomo(tmp_path / "a.nxs", **{f"instrument__detector__{n}": v for n, v in sets.items()})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        stack = opened(path, flat=20_000.0, find_bad_pixels=False).stack
+        found = opened(path, flat=20_000.0, find_bad_pixels=False).whole()
+    assert any("is not used" in str(one.message) for one in caught) is (case in ("NaN", "a text"))
+    assert stack.top == top
+    assert np.array_equal(found.mask.numpy(), grey() < top)
+
+
+def test_values_below_a_detectors_underload_are_warned_of(tmp_path):
+    path = tomo(tmp_path / "a.nxs", instrument__detector__underload_value=3)
+    with pytest.warns(UserWarning, match="underload_value: is not applied"):
+        opened(path)
+
+
+NUMBERS = np.arange(len(KEYS))
+SEQUENCES = {
+    "of all frames": (NUMBERS + 1, None),
+    "of each kind": (np.where(KEYS == 0, np.cumsum(KEYS == 0), 0), None),
+    "of the views": (np.arange(VIEWS), None),
+    "in steps of two": (2 * NUMBERS, None),
+    "never filled": (0 * NUMBERS, None),
+    "a dropped frame": (NUMBERS + (NUMBERS > 9), "1 gaps between views, such as from 9 to 11"),
+    "two dropped views": (np.delete(np.arange(14), [3, 8]), "2 gaps between views"),
+    "other numbers": (np.arange(5), "a number of each of 19 frames or 12 views, got 5"),
+}
+
+
+@pytest.mark.parametrize("case", SEQUENCES)
+def test_frames_in_the_order_of_their_sequence_numbers_are_read(case, tmp_path):
+    """Counted for all frames or for each kind; dropped frames are warned of."""
+    numbers, words = SEQUENCES[case]
+    path = tomo(tmp_path / "a.nxs", instrument__detector__sequence_number=numbers)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(path)
+    assert [words in str(one.message) for one in caught if words] == [True] * (words is not None)
+    assert len(caught) == (words is not None)
+
+
+@pytest.mark.parametrize("numbers", [NUMBERS[::-1], NUMBERS // 2, np.r_[1, 0, NUMBERS[2:]]])
+def test_frames_in_another_order_than_their_sequence_numbers_are_refused(numbers, tmp_path):
+    """Reversed, repeated, and two exchanged; those of fields alone do not count."""
+    path = tomo(tmp_path / "a.nxs", instrument__detector__sequence_number=numbers)
+    if numbers[0] == 1:  # a flat and a dark field
+        opened(path)
+        return
+    with pytest.raises(Refused, match="sequence_number: expected views in the order"):
+        opened(path)
 
 
 @pytest.mark.parametrize(("unit", "warned"), [(b"nm", False), (b"um", True), (b"mm", True)])

@@ -197,6 +197,7 @@ CASES = {
     "EDF in another file": (edf, {"EDF_BinaryFileName": "../x"}, "no EDF_BinaryFileName"),
     "packed EDF": (edf, {"Compression": "GzipCompression"}, "Compression none"),
     "EDF of 3 axes": (edf, {"Dim_3": 2}, "Dim_3 1, got '2'"),
+    "EDF with a mark of bad pixels": (edf, {"Dummy": -10}, "no Dummy, got '-10'.*bad_pixels"),
     "EDF of other numbers": (edf, {"DataType": "Packed"}, "DataType"),
     "HIS of floats": (his, {"number": 16}, "TypeOfNumbers 4, got 16"),
     "HIS of a panel that is not square": (his, {}, "as many rows as columns"),
@@ -216,6 +217,34 @@ def test_what_rtk_reads_wrongly_is_refused(name, tmp_path):
     write(path, grey(60_000, (5, 8))[0].astype("u2"), **options)
     with pytest.raises(Refused, match=match):
         opened(path, flat=6e4, layout="projections")
+
+
+EXPOSURES = {
+    "count_time": ("ExposureTime", [{"count_time": t} for t in (0.2, 0.1, 0.1)]),
+    "ExposureTime": ("ExposureTime", [{"ExposureTime": f"{t}"} for t in (2, 1, 1)]),
+    "acq_expo_time": ("ExposureTime", [{"acq_expo_time": f"{t:e}"} for t in (0.02, 0.01, 0.01)]),
+    "srcur": (
+        "srcur",
+        [{"counter_mne": "mon srcur", "counter_pos": f"7 {i}"} for i in (200, 100, 100)],
+    ),
+}
+
+
+@needs_rtk
+@pytest.mark.parametrize("case", EXPOSURES)
+def test_exposures_of_edf_are_applied_by_their_name(case, tmp_path):
+    """A view of twice the exposure of the flat field has the integrals of the other; a time that is
+    no number is none.
+    """
+    name, stated = EXPOSURES[case]
+    for k, light in enumerate((2, 1)):
+        edf(tmp_path / f"view_{k}.edf", grey(20_000)[0].astype("u2") * light, **stated[k])
+    edf(tmp_path / "refHST0000.edf", np.full((12, 12), 30_000, "u2"), **stated[2])
+    with pytest.warns(UserWarning, match=f"several values of {name}"):
+        views = opened(tmp_path, exposure=name, find_bad_pixels=False).whole().views
+    np.testing.assert_allclose(views[0], views[1], atol=1e-6)
+    edf(tmp_path / "other.edf", grey(20_000)[0].astype("u2"), count_time="auto")
+    assert opened(tmp_path / "other.edf", flat=6e4).stack.exposure("ExposureTime") is None
 
 
 @needs_rtk

@@ -188,6 +188,8 @@ def test_decimals_in_names_decide_the_order(tmp_path):
         [f"p_{360 / 7 * k:.2f}" for k in range(7)],
         ["p1.9", "p1.10", "p1.11"],  # 1.10 is no decimal beside 1.9
         ["1.2.9", "1.2.10", "1.2.11"],
+        ["p_.25", "p_.5", "p_.75"],
+        ["p_8.5", "p_9.5", "p_10.5"],
     ):
         paths = [tmp_path / f"{name}.tif" for name in names]
         assert ordered(paths[::-1]) == paths
@@ -228,6 +230,9 @@ def test_an_index_beside_another_number_shows_that_no_view_is_missing(tmp_path):
         ["s-1_0", "s-2_-10", "s-3_-20"],
         ["scan-1", "scan-2", "scan-10"],
         ["2021-03-05_-5", "2021-03-05_0", "2021-03-05_5"],
+        ["proj_-0.5", "proj_0.5", "proj_1.5", "proj_2.5"],
+        ["a_-_1", "a_-_2", "a_-_3"],
+        ["2021-03-05", "2021-03-06", "2021-03-07"],
     ],
 )
 def test_a_sign_is_part_of_a_number_and_a_dash_is_not(names, tmp_path):
@@ -240,6 +245,56 @@ def test_a_sign_is_part_of_a_number_and_a_dash_is_not(names, tmp_path):
     with warnings.catch_warnings(action="error"):
         files = ordered(paths[::-1], gaps)
     assert files == paths
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["p_1e-1", "p_5e-1", "p_1e0", "p_5e0", "p_1e1"],
+        ["p_1e-1", "p_2e-1", "p_3e-1"],
+        ["p_5e-2", "p_1e-1", "p_1.5e-1", "p_2e-1"],
+        ["p_0.0e0", "p_5.0e1", "p_1.0e2", "p_1.5e2"],
+        ["1E-1", "1E+0", "1E+1"],
+        ["p_-1e-1", "p_0e-1", "p_1e-1"],
+        ["p_-2e-1_a", "p_-1e-1_a", "p_1e-1_a"],
+        ["p_1e1", "p_1e2", "p_1e3"],
+    ],
+)
+def test_numbers_with_exponents_decide_the_order(names, tmp_path):
+    """That of 1e1, 1e2 and 1e3 is the same for numbers and for two numbers."""
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    assert ordered(paths[::-1], gaps=True) == paths
+
+
+@pytest.mark.parametrize(
+    ("names", "such"),
+    [
+        (["p_1e1", "p_1e2", "p_5e1", "p_5e2"], "1e1"),
+        (["3e9", "12e1"], "3e9"),
+        (["p_0,0", "p_0,25", "p_0,5"], "0,0"),
+        (["p_1,5", "p_1,25"], "1,5"),
+    ],
+)
+def test_numbers_that_can_be_read_in_two_orders_are_refused(names, such, tmp_path):
+    with pytest.raises(Refused, match=f"read in one way, got {such}, which may be"):
+        ordered([tmp_path / f"{name}.tif" for name in names])
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["p_-10.5", "p_-1.5", "p_-0.5"],
+        ["tilt_-30", "tilt_-20", "tilt_-10"],
+        ["-3", "-2", "-1"],
+        ["a=-2 b", "a=-1 b"],
+        ["p_-.75", "p_-.5", "p_-.25"],
+    ],
+)
+def test_numbers_that_are_all_negative_are_named(names, tmp_path):
+    """A - behind a separator is a sign, though all names have it; in scan-001 it is a dash."""
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    with pytest.warns(UserWarning, match="are taken to be negative"):
+        assert ordered(paths[::-1], gaps=True) == paths
 
 
 @pytest.mark.parametrize("others", [["scan~00"], ["scan_spr"], ["ob_1", "ob_2"], ["refHST0000"]])

@@ -141,6 +141,21 @@ def test_images_of_several_exposure_times_are_warned_of(last, tmp_path):
     assert any("values of ExposureTime" in str(one.message) for one in caught) is (last > 1)
 
 
+@pytest.mark.parametrize(
+    ("name", "tag"), [("ISOSpeedRatings", (34855, "H")), ("FNumber", (33437, "2I"))]
+)
+def test_flat_fields_of_another_gain_of_the_camera_are_warned_of(name, tag, tmp_path):
+    """In EXIF's tags, as cameras write them."""
+    for file, value in (("view", 4), ("same", 4), ("other", 8)):
+        value = (value, 1) if tag[1] == "2I" else value
+        written(tmp_path / f"{file}.tif", grey()[0], extratags=[(*tag, 1, value, True)])
+    options = {"layout": "projections", "find_bad_pixels": False}
+    with warnings.catch_warnings(action="error"):
+        opened(tmp_path / "view.tif", flat=str(tmp_path / "same.tif"), **options)
+    with pytest.warns(UserWarning, match=f"the flat field has the {name} .*8.*, its views have"):
+        opened(tmp_path / "view.tif", flat=str(tmp_path / "other.tif"), **options)
+
+
 @pytest.mark.parametrize("kind", ["u2", "i2"])
 def test_sixteen_bits_with_a_sign_of_imagej_are_read_with_their_sign(kind, tmp_path):
     """ImageJ stores them 2^15 greater, with a description; other programs keep that beside numbers

@@ -18,6 +18,8 @@ from mvrecon.geometry.rigid import euler_rotation
 NUMBERS = ("SrcToObject", "SrcToDetector", "DetectorPixelSizeX", "DetectorPixelSizeY")
 ANGLES = ("InitialAngle", "AngularStep")
 COUNTS = ("Projections", "DetectorPixelsX", "DetectorPixelsY")
+#: Values of an entry that is switched off.
+NO = ("false", "no", "none", "off", 0)
 KEYS = (
     *(Key(name, "applied") for name in (*NUMBERS, *ANGLES, "ObjectTilt")),
     Key("ObjectOffsetX, ObjectRoll", "applied", "else by CentreOfRotationTop and Bottom"),
@@ -33,7 +35,22 @@ KEYS = (
     Key(".ang, _ctdata.txt", "compared", "files of measured angles, with AngularStep; warned of"),
     Key("Units", "refused", "lengths in mm", ("mm",)),
     Key("DetectorOffsetX, DetectorOffsetY", "refused", "give camera=circular an offset_mm", (0,)),
-    Key("Shuttling", "refused", "images in the order of their angles", ("false", 0)),
+    Key("Shuttling", "refused", "images in the order of their angles", NO),
+    Key("InvertedImages", "refused", "grey values that rise with intensity", NO),
+    Key("AngleFile", "refused", "AngularStep alone; give camera=circular with camera.angles"),
+    Key(
+        "Angles",
+        "refused",
+        "AngularStep alone; give camera=circular with camera.angles",
+        ("equal", "equidistant", "even", "linear", "regular", "uniform"),
+    ),
+    Key(
+        "FluxNormalisation",
+        "refused",
+        "WhiteLevel alone; remove it, and say calibrate=[gains], or give views.exposure",
+        NO,
+    ),
+    Key("FramesPerProjection", "ignored", "WhiteLevel is that of the averaged images"),
     Key("Scattering", "refused", "of Nikon's own reconstruction", (0,)),
     Key(
         "VoxelsX, VoxelSizeX, OffsetX, MaskRadius, RegionStartX, RegionPixelsX",
@@ -60,7 +77,6 @@ NIKON_EFFECTS = {
     "level|tilt|roll|pitch|yaw|shift|step|direction|clockwise|rotat|distort|binn|object|detector|"
     "heli|spiral|conveyor|scan.?type": 0,
 }
-NOTHING = ("", "false", "no", "none", "off")
 
 
 class Header(NamedTuple):
@@ -107,7 +123,7 @@ def header(path: str | Path) -> Header:
         f"{name}={value}"
         for name, value in texts.items()
         if name not in KNOWN
-        and value.lower() not in NOTHING
+        and value.lower() not in ("", *NO)
         and has_effect(name, value, NIKON_EFFECTS)
     ]
     if unknown:

@@ -1,0 +1,175 @@
+"""What programs describe in a TIFF beside its tags: OME (Goldberg and others, Genome Biology 6,
+2005), Micro-Manager, and the detectors of Dectris, whose negative pixels are bad ones.
+"""
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvrecon.core.files.checks import Refused, millimetres, shown
+from mvrecon.core.files.keys import Key
+from mvrecon.data.projections.exposures import in_base_units
+from mvrecon.data.projections.stack import Header
+
+#: OME's types of pixels.
+TYPES = {f"int{bits}": f"i{bits // 8}" for bits in (8, 16, 32)}
+TYPES |= {f"u{name}": f"u{kind[1:]}" for name, kind in TYPES.items()}
+TYPES |= {"float": "f4", "double": "f8"}
+#: OME's elements with attributes on which grey values depend in a way that is not stated.
+OME_BEAM = {
+    "DetectorSettings": ("Gain", "Offset", "Binning", "Integration"),
+    "LightSourceSettings": ("Attenuation",),
+}
+#: Entries of Dectris on which grey values depend in a way that is not stated.
+DECTRIS_BEAM = (
+    *("Tau", "Ratecorr_lut_directory", "Retrigger_mode", "Flat_field"),
+    *("Threshold_setting", "Gain_setting", "Energy_range"),
+)
+KEYS = (
+    Key(
+        "OME: Plane ExposureTime, Micro-Manager: Exposure-ms, Dectris: Exposure_time",
+        "compared",
+        "as ExposureTime, in their units",
+    ),
+    Key("Dectris: Filter_transmission", "compared", "as ExposureTime, under its own name"),
+    Key(
+        ", ".join(
+            [f"OME: {name} {key}" for name, own in OME_BEAM.items() for key in own]
+            + [f"Dectris: {name}" for name in DECTRIS_BEAM]
+        ),
+        "compared",
+        "of views and flat fields; warned of",
+    ),
+    Key(
+        "OME: SignificantBits, Micro-Manager: BitDepth, Dectris: Count_cutoff",
+        "applied",
+        "the greatest grey value",
+    ),
+    Key("OME: Type", "compared", "with the type of the pixels"),
+    Key(
+        "Dectris: N_excluded_pixels",
+        "compared",
+        "with the number of negative pixels, which are bad ones; warned of if there are fewer",
+    ),
+    Key("Dectris: Pixel_size", "compared", "with the cameras' pixel size"),
+    Key(
+        "Dectris: Start_angle, Dectris: Angle_increment, Dectris: Detector_distance, "
+        "Dectris: Beam_xy",
+        "ignored",
+        "the camera decides",
+    ),
+)
+#: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
+OME, ATTRIBUTE = re.compile(r"<(\w+:)?OME\b"), re.compile(r"([\w-]+)\s*=\s*[\"']([^\"']*)[\"']")
+LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
+NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
+
+
+def elements(text: str, name: str) -> list[dict[str, str]]:
+    """The attributes of each element of OME's description of a name; none of other texts."""
+    found = re.findall(rf"<(?:\w+:)?{name}\b([^>]*)>", text) if OME.search(text) else []
+    return [dict(ATTRIBUTE.findall(attributes)) for attributes in found]
+
+
+def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
+    """The header of one page with what Micro-Manager and Dectris state of it.
+
+    Args:
+        file: for messages.
+        head: by the tags of the page.
+        text: the description of the page.
+        manager: metadata of Micro-Manager, None of others.
+
+    Raises:
+        Refused: entries that are no numbers, or more bits than pixels have.
+    """
+    stated = {name: list(texts) for name, texts in head.stated.items()}
+    if isinstance(manager, dict):
+        if manager.get("BitDepth") is not None:
+            head = head._replace(tops=_tops(file, "BitDepth", manager["BitDepth"], head))
+        if (ms := manager.get("Exposure-ms")) is not None:
+            _add(stated, "ExposureTime", 0, milliseconds(file, float(ms), "ms"))
+    entries = dict(LINE.findall(text))
+    if not {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
+        return head._replace(stated=stated)
+
+    def numbers(name: str, count: int = 1) -> tuple[list[float], str]:
+        found = NUMBER.findall(entries[name])
+        if len(found) < count:
+            raise Refused(f"{file}: expected {name} as {count} numbers, got {shown(entries[name])}")
+        return [float(number) for number, _ in found[:count]], found[0][1]
+
+    for name in {*DECTRIS_BEAM} & {*entries}:
+        _add(stated, name, 0, entries[name])
+    if "Exposure_time" in entries:
+        (time,), unit = numbers("Exposure_time")
+        _add(stated, "ExposureTime", 0, milliseconds(file, time, unit))
+    if "Filter_transmission" in entries:
+        _add(stated, "Filter_transmission", 0, f"{numbers('Filter_transmission')[0][0]:g}")
+    if "Count_cutoff" in entries:
+        head = head._replace(tops=frozenset(numbers("Count_cutoff")[0]))
+    if "Pixel_size" in entries:
+        (right, down), unit = numbers("Pixel_size", 2)
+        mm = millimetres(file, unit)
+        head = head._replace(pixel_mm=(down * mm, right * mm))
+    if head.dtype.kind == "i":
+        excluded = numbers("N_excluded_pixels")[0] if "N_excluded_pixels" in entries else [0]
+        head = head._replace(excluded=int(excluded[0]))
+    return head._replace(stated=stated)
+
+
+def of_file(file: Path, head: Header, text: str) -> Header:
+    """The header of all pages, in the order of the images, with what OME states of them.
+
+    Args:
+        file: for messages.
+        head: by the pages.
+        text: the description of the first page.
+
+    Raises:
+        Refused: another type of pixels than it states, or more bits than they have.
+    """
+    stated = {name: list(texts) for name, texts in head.stated.items()}
+    for pixels in elements(text, "Pixels"):
+        kind = pixels.get("Type", "")
+        if np.dtype(TYPES.get(kind, head.dtype)) != head.dtype.newbyteorder("="):
+            raise Refused(f"{file}: expected pixels of OME's Type {kind}, got {head.dtype}")
+        if (bits := pixels.get("SignificantBits")) is not None:
+            head = head._replace(tops=_tops(file, "SignificantBits", bits, head))
+    for name, keys in OME_BEAM.items():
+        for key in keys:
+            found = sorted({one[key] for one in elements(text, name) if key in one})
+            for page in range(head.pages if found else 0):
+                _add(stated, f"{name} {key}", page, " or ".join(found), head.pages)
+    for plane in elements(text, "Plane"):
+        page = sum(int(plane.get(f"The{axis}", 0)) for axis in "ZCT")  # one of them runs
+        if "ExposureTime" in plane and page < head.pages:
+            unit = plane.get("ExposureTimeUnit", "s")
+            time = milliseconds(file, float(plane["ExposureTime"]), unit)
+            _add(stated, "ExposureTime", page, time, head.pages)
+    return head._replace(stated=stated)
+
+
+def milliseconds(file: Path, time: float, unit: str) -> str:
+    """An exposure time in ms, as in DICOM; "" of an unknown unit."""
+    seconds = float(in_base_units(np.array(time), "ExposureTime", unit, file))
+    return "" if math.isnan(seconds) else f"{1000 * seconds:.6g}"
+
+
+def _add(stated: dict[str, list[str]], name: str, page: int, text: str, pages: int = 1) -> None:
+    """Add what a page states by a name; both where the page states something else already."""
+    texts = stated.setdefault(name, [""] * pages)
+    texts[page] = " or ".join(sorted({texts[page], text} - {""}))
+
+
+def _tops(file: Path, name: str, bits: Any, head: Header) -> frozenset[float | None]:
+    """The greatest grey value of so many bits; none of floats."""
+    if head.dtype.kind == "f":
+        return head.tops
+    if not 0 < int(bits) <= 8 * head.dtype.itemsize:
+        most = 8 * head.dtype.itemsize
+        raise Refused(f"{file}: expected {name} from 1 to {most} bits, got {bits}")
+    return frozenset([2.0 ** (int(bits) - (head.dtype.kind == "i")) - 1])
