@@ -2,11 +2,9 @@
 2015), Data Exchange (De Carlo and others, J. Synchrotron Rad. 21, 2014), or any data set of frames.
 """
 
-import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,29 +26,26 @@ from mvrecon.data.linked import (
     texts_at,
     values_at,
 )
-from mvrecon.data.projections import exposures, nexus_axes
+from mvrecon.data.projections import exposures, nexus_axes, nexus_detector
 from mvrecon.data.projections.frames import EXPECTED, Frames, FrameViews
+from mvrecon.data.projections.nexus_detector import (
+    ALIGNMENT,
+    BEAM,
+    DARK,
+    DETECTOR_BEAM,
+    FLAT,
+    INVALID,
+    VIEW,
+    limits_of,
+    of_frames,
+    there,
+)
 from mvrecon.data.projections.stack import Hdf5Views, ProjectionStack
-from mvrecon.data.storage import check_chunks, dataset_in, held, opened
+from mvrecon.data.storage import held, opened
 
 FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 #: Names of a data set, or of one in another file.
 IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
-#: Frames of views, flat and dark fields by their image_key; others are left out.
-VIEW, FLAT, DARK, INVALID, ALIGNMENT = 0, 1, 2, 3, -1
-#: Data sets of a detector of NeXus, and of an entry, on which grey values depend in a way that is
-#: not stated.
-DETECTOR_BEAM = (
-    *("gain_setting", "threshold_energy", "flatfield_applied", "pixel_mask_applied"),
-    *("countrate_correction_applied", "angular_calibration_applied"),
-)
-BEAM = (
-    *("instrument/beam/incident_energy", "instrument/beam/incident_wavelength"),
-    *("instrument/monochromator/energy", "instrument/source/voltage"),
-)
-#: Of a detector, by whether they are single numbers.
-LIMITS = {"pixel_mask": 0, "sequence_number": 0}
-LIMITS |= dict.fromkeys(("saturation_value", "bit_depth_readout", "underload_value"), 1)
 AXIS = "calibrate=[offset_u] finds the axis"
 #: Data sets of NXtomo and Data Exchange.
 KEYS = (
@@ -91,10 +86,6 @@ KEYS = (
     ),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
     Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
-    Key("pixel_mask", "applied", "bad pixels, all but 0; another size is warned of"),
-    Key("saturation_value, bit_depth_readout", "applied", "the greatest grey value; the first"),
-    Key("underload_value", "compared", "with 0; warned of"),
-    Key("sequence_number", "compared", "with the order of the views; gaps are warned of"),
     Key(
         "instrument/<group>/attenuator_transmission",
         "compared",
@@ -119,15 +110,13 @@ KEYS = (
         "ignored",
         "the detector's own; flat fields correct unequal pixels",
     ),
+    *nexus_detector.KEYS,
     *nexus_axes.KEYS,
 )
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Units of line integrals.
 LOGARITHMS = re.compile(r"absor|optical.?dens|^od$|attenuation|^ln|log|1/|\^-1", re.IGNORECASE)
-#: The type of numbers, and a number as text, with its unit.
-NUMERIC = re.compile(r"(u?int|float|bool)\d*")
-NUMBER = re.compile(r"([-+.\d]+(?:[eE][-+]?\d+)?)\s*(\D*)")
 #: Pixels by which a sample may move between views.
 MAX_MOVE_PX = 0.1
 
@@ -267,7 +256,7 @@ class _Layout(NamedTuple):
         kind = None if source is None else texts_at([source], "", EXPECTED).get(source)
         parallel = kind is None or PARALLEL.search(kind)
         for axis, option in (("x", "columns"), ("y", "rows")):
-            flipped = _there(path, f"{group}/{axis}_flipped")
+            flipped = there(path, f"{group}/{axis}_flipped")
             if flipped is not None and values_at(flipped, EXPECTED).any():
                 warnings.warn(
                     f"{flipped}: the {option} of the frames are mirrored; without "
@@ -296,7 +285,7 @@ class _Layout(NamedTuple):
                     (entry, (*exposures.MONITORS, *shares, *BEAM)),
                 )
                 for name in names
-                if (place := _there(path, f"{above}/{name}")) is not None
+                if (place := there(path, f"{above}/{name}")) is not None
             ],
             moves=[p for axis in "xyz" if (p := first(f"sample/{axis}_translation")) is not None],
             detector=Place(path, group),
@@ -317,7 +306,7 @@ class _Layout(NamedTuple):
             for name in ("data_white", "data_dark", "theta")
         }
         kept = [("flat", places["data_white"]), ("dark", places["data_dark"])]
-        times = [_there(path, "/measurement/instrument/detector/exposure_time"), _flat_time(path)]
+        times = [there(path, "/measurement/instrument/detector/exposure_time"), _flat_time(path)]
         stated = [[(exposures.EXCHANGE, time)] if time is not None else [] for time in times]
         return cls(
             frames,
@@ -350,7 +339,7 @@ class _Layout(NamedTuple):
         lengths = [place for pair in self.pixel for place in pair]
         monitors = [place for _, place in (*self.exposures, *self.flats)]
         units = texts_at([*lengths, *monitors], "units", EXPECTED)
-        stated = {n: _of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
+        stated = {n: of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
         fields: dict[str, ProjectionStack] = {
             name: FrameViews(frames, np.flatnonzero(keys == key), stated=stated)
             for name, key in (("flat", FLAT), ("dark", DARK))
@@ -360,7 +349,7 @@ class _Layout(NamedTuple):
             others = Frames(place, folder)
             kind = np.full(others.shape[0], FLAT)
             of_flats = {
-                n: _of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
+                n: of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
             }
             fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats)
         unit = texts_at([self.frames], "units", EXPECTED).get(self.frames, "")
@@ -390,32 +379,9 @@ class _Layout(NamedTuple):
                     f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
                     stacklevel=2,
                 )
-        return FrameViews(frames, views, fields, rig, folder, stated, *self._limits(frames, keys))
-
-    def _limits(self, frames: Frames, keys: np.ndarray) -> tuple[np.ndarray | None, float | None]:
-        """Pixels that the detector's mask marks as bad, and its greatest grey value; None of what
-        it does not state. Compares the order of the frames.
-
-        Warns:
-            UserWarning: a mask of another size, other values than one number, an underload.
-        """
-        places = {
-            name: place
-            for name in LIMITS
-            if self.detector is not None
-            and (place := _there(self.detector.path, f"{self.detector.name}/{name}")) is not None
-        }
-        if (place := places.get("sequence_number")) is not None:
-            _check_sequence(place, keys)
-        numbers = {name: _number(place) for name, place in places.items() if LIMITS[name] == 1}
-        if numbers.get("underload_value", 0) > 0:
-            place = places["underload_value"]
-            warnings.warn(f"{place}: is not applied: values below it are wrong", stacklevel=2)
-        top, bits = (numbers.get(name) for name in ("saturation_value", "bit_depth_readout"))
-        if not top and bits and frames.dtype.kind in "iu":
-            top = min(2.0**bits - 1, float(np.iinfo(frames.dtype).max))
-        place = places.get("pixel_mask")
-        return None if place is None else _mask(place, frames.shape[1:]), top or None
+        return FrameViews(
+            frames, views, fields, rig, folder, stated, *limits_of(self.detector, frames, keys)
+        )
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
         """Rows' and columns' pitch; None if the file has none with units."""
@@ -434,154 +400,21 @@ class _Layout(NamedTuple):
         return None
 
 
-def _there(path: Path, name: str) -> Place | None:
-    """A data set that is not needed: None as well if it is in a file that is not there."""
-    try:
-        return followed(path, name, EXPECTED)
-    except MissingFile:
-        return None
-
-
 def _members(path: Path, entry: str, name: str) -> list[str]:
     """The names of what is in a group of an entry, behind that of the group."""
-    if (place := _there(path, f"{entry}/{name}")) is None:
+    if (place := there(path, f"{entry}/{name}")) is None:
         return []
     with opened(place.path, EXPECTED) as file:
         group: Any = file[place.name]
         return [f"{name}/{inner}" for inner in group] if isinstance(group, h5py.Group) else []
 
 
-def _number(place: Place) -> float:
-    """A number of a detector; 0 of another one, with a warning."""
-    with _unneeded():
-        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
-        if len(values) != 1 or not np.isfinite(values[0]):
-            raise Refused(f"{place}: expected one number, got {shown(values.tolist())}")
-        return float(values[0])
-    return 0.0
-
-
-def _mask(place: Place, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Bad pixels by a detector's mask [v u]; None of another one, with a warning."""
-    with _unneeded("; give it as views.bad_pixels"), opened(place.path, EXPECTED) as file:
-        stored = dataset_in(place.path, file, place.name, EXPECTED)
-        if stored.dtype.kind not in "biu" or (*stored.shape[-2:], stored.size) != (
-            *shape,
-            math.prod(shape),
-        ):
-            got = f"{stored.dtype} {stored.shape}"
-            raise Refused(f"{place}: expected a mask of {shape} pixels, got {got}")
-        check_chunks(place.path, stored)
-        return stored[()].reshape(shape) != 0
-    return None
-
-
-@contextmanager
-def _unneeded(cure: str = "") -> Iterator[None]:
-    """Warn of what is refused within, instead of raising, as the views do not need it."""
-    try:
-        yield
-    except Refused as error:
-        warnings.warn(f"{error}; it is not used{cure}", stacklevel=4)
-
-
-def _check_sequence(place: Place, keys: np.ndarray) -> None:
-    """Compare the sequence numbers of frames, counted for all or for each kind, with their order.
-
-    Warns:
-        UserWarning: frames between views are missing, or another number of numbers.
-
-    Raises:
-        Refused: views are not in the order of their numbers.
-    """
-    numbers, views = values_at(place, EXPECTED, ("units",)).ravel(), np.flatnonzero(keys == VIEW)
-    if len(numbers) not in (len(keys), len(views)):
-        warnings.warn(
-            f"{place}: expected a number of each of {len(keys)} frames or {len(views)} views, got "
-            f"{len(numbers)}, which are not used",
-            stacklevel=2,
-        )
-        return
-    own = (numbers[views] if len(numbers) == len(keys) else numbers).astype(float)
-    steps, apart = np.diff(own), np.diff(views)
-    if not steps.any():  # never filled
-        return
-    if (steps <= 0).any():
-        first = int(np.argmax(steps <= 0))
-        raise Refused(
-            f"{place}: expected views in the order of their sequence numbers, got "
-            f"{own[first]:g} and then {own[first + 1]:g}; sort frames and angles by them"
-        )
-    least = (steps[apart == 1] if (apart == 1).any() else steps).min()
-    if (gaps := (steps != least) & (steps != least * apart)).any():
-        first = int(np.argmax(gaps))
-        warnings.warn(
-            f"{place}: {gaps.sum()} gaps between views, such as from {own[first]:g} to "
-            f"{own[first + 1]:g}: frames were dropped, and angles must be those of the others",
-            stacklevel=2,
-        )
-
-
 def _flat_time(path: Path) -> Place | None:
     """The exposure time of Data Exchange's flat fields, where it is not that of the views."""
     above = "/process/acquisition/flat_fields"
-    if (differs := _there(path, f"{above}/different_flat_exposure")) is not None:
+    if (differs := there(path, f"{above}/different_flat_exposure")) is not None:
         text = texts_at([differs], "", EXPECTED)[differs].strip().lower()  # or a type of numbers
         number = re.match("u?int|bool", text) is not None
         if text in ("same", "no") or (number and not values_at(differs, EXPECTED).any()):
             return None
-    return _there(path, f"{above}/flat_exposure_time")
-
-
-def _of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarray:
-    """What a file states of each frame by a name, as texts: an exposure in s or A, or a property of
-    the beam; of one value for all, one of each frame, or one of each view; "" of frames without.
-
-    Warns:
-        UserWarning: no numbers of an exposure, another number of them, or a time or current of an
-            unknown unit; views that differ where flat fields state none.
-    """
-    stated, views = np.full(len(keys), "", object), keys == VIEW
-    texts: list[str] = []
-    with _unneeded():
-        texts = _texts_of(name, place, unit)
-        if len(texts) not in (1, len(keys), views.sum()):
-            raise Refused(
-                f"{place}: expected one {name}, or one of each of {len(keys)} frames or "
-                f"{views.sum()} views, got {len(texts)}"
-            )
-        stated[views if len(texts) == views.sum() else slice(None)] = texts
-    if exposures.kind_of(name) == "beam":
-        exposures.warn_of_several(place.path, name, stated[views])
-        return stated
-    own, flats = (np.array([float(t) for t in stated[w] if t]) for w in (views, keys == FLAT))
-    changes = len(own) and np.ptp(own) > exposures.MAX_CHANGE * abs(own.mean())
-    if changes and not (len(flats) and (flats > 0).all()):
-        warnings.warn(
-            f"{place.path}: {name}: of the views is {own.min():.4g} to {own.max():.4g}, which "
-            f"is not corrected unless views.exposure=<file> states it",
-            stacklevel=2,
-        )
-    return stated
-
-
-def _texts_of(name: str, place: Place, unit: str) -> list[str]:
-    """What a data set states, as texts; "" of what is not finite, or of an unknown unit.
-
-    Raises:
-        Refused: an exposure that is no number, or many texts.
-    """
-    text = texts_at([place], "", EXPECTED).get(place, "").strip()  # or the type of numbers
-    beam, number = exposures.kind_of(name) == "beam", NUMBER.fullmatch(text)
-    if beam and not NUMERIC.fullmatch(text):
-        if re.fullmatch(r"object|\|S\d+", text):  # texts of each frame
-            raise Refused(f"{place}: expected one {name} of all frames, got many texts")
-        return [text]
-    if number:
-        values, unit = np.array([float(number[1])]), number[2] or unit
-    else:
-        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
-    if not beam:
-        values = exposures.in_base_units(values, name, unit, place)
-    end = f" {unit}".rstrip() if beam else ""
-    return [f"{x:.12g}{end}" if np.isfinite(x) else "" for x in values]
+    return there(path, f"{above}/flat_exposure_time")

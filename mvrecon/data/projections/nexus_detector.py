@@ -1,0 +1,210 @@
+"""What a detector of NeXus states beside its frames: their kinds and order, exposures, bad pixels
+and greatest grey value (Könnecke and others, J. Appl. Cryst. 48, 2015).
+"""
+
+import math
+import re
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from mvrecon.core.files.checks import Refused, shown
+from mvrecon.core.files.keys import Key
+from mvrecon.data.linked import MissingFile, Place, followed, texts_at, values_at
+from mvrecon.data.projections import exposures
+from mvrecon.data.projections.frames import EXPECTED, Frames
+from mvrecon.data.storage import check_chunks, dataset_in, opened
+
+#: Frames of views, flat and dark fields by their image_key; others are left out.
+VIEW, FLAT, DARK, INVALID, ALIGNMENT = 0, 1, 2, 3, -1
+#: Data sets of a detector of NeXus, and of an entry, on which grey values depend in a way that is
+#: not stated.
+DETECTOR_BEAM = (
+    *("gain_setting", "threshold_energy", "flatfield_applied", "pixel_mask_applied"),
+    *("countrate_correction_applied", "angular_calibration_applied"),
+)
+BEAM = (
+    *("instrument/beam/incident_energy", "instrument/beam/incident_wavelength"),
+    *("instrument/monochromator/energy", "instrument/source/voltage"),
+)
+#: Single numbers of a detector.
+NUMBERS = ("saturation_value", "bit_depth_readout", "underload_value")
+#: The type of numbers, and a number as text, with its unit.
+NUMERIC = re.compile(r"(u?int|float|bool)\d*")
+NUMBER = re.compile(r"([-+.\d]+(?:[eE][-+]?\d+)?)\s*(\D*)")
+KEYS = (
+    Key("pixel_mask", "applied", "bad pixels, all but 0; another size is warned of"),
+    Key("saturation_value, bit_depth_readout", "applied", "the greatest grey value; the first"),
+    Key("underload_value", "compared", "with 0; warned of"),
+    Key("sequence_number", "compared", "with the order of the views; gaps are warned of"),
+)
+
+
+def there(path: Path, name: str) -> Place | None:
+    """A data set that is not needed: None as well if it is in a file that is not there."""
+    try:
+        return followed(path, name, EXPECTED)
+    except MissingFile:
+        return None
+
+
+def of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarray:
+    """What a file states of each frame by a name, as texts: an exposure in s or A, or a property of
+    the beam; of one value for all, one of each frame, or one of each view; "" of frames without.
+
+    Warns:
+        UserWarning: no numbers of an exposure, another number of them, or a time or current of an
+            unknown unit; views that differ where flat fields state none.
+    """
+    stated, views = np.full(len(keys), "", object), keys == VIEW
+    texts: list[str] = []
+    with _unneeded():
+        texts = _texts_of(name, place, unit)
+        if len(texts) not in (1, len(keys), views.sum()):
+            raise Refused(
+                f"{place}: expected one {name}, or one of each of {len(keys)} frames or "
+                f"{views.sum()} views, got {len(texts)}"
+            )
+        stated[views if len(texts) == views.sum() else slice(None)] = texts
+    if exposures.kind_of(name) == "beam":
+        exposures.warn_of_several(place.path, name, stated[views])
+        return stated
+    own, flats = (np.array([float(t) for t in stated[w] if t]) for w in (views, keys == FLAT))
+    changes = len(own) and np.ptp(own) > exposures.MAX_CHANGE * abs(own.mean())
+    if changes and not (len(flats) and (flats > 0).all()):
+        warnings.warn(
+            f"{place.path}: {name}: of the views is {own.min():.4g} to {own.max():.4g}, which "
+            f"is not corrected unless views.exposure=<file> states it",
+            stacklevel=2,
+        )
+    return stated
+
+
+def _texts_of(name: str, place: Place, unit: str) -> list[str]:
+    """What a data set states, as texts; "" of what is not finite, or of an unknown unit.
+
+    Raises:
+        Refused: an exposure that is no number, or many texts.
+    """
+    text = texts_at([place], "", EXPECTED).get(place, "").strip()  # or the type of numbers
+    beam, number = exposures.kind_of(name) == "beam", NUMBER.fullmatch(text)
+    if beam and not NUMERIC.fullmatch(text):
+        if re.fullmatch(r"object|\|S\d+", text):  # texts of each frame
+            raise Refused(f"{place}: expected one {name} of all frames, got many texts")
+        return [text]
+    if number:
+        values, unit = np.array([float(number[1])]), number[2] or unit
+    else:
+        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+    if not beam:
+        values = exposures.in_base_units(values, name, unit, place)
+    end = f" {unit}".rstrip() if beam else ""
+    return [f"{x:.12g}{end}" if np.isfinite(x) else "" for x in values]
+
+
+def limits_of(
+    detector: Place | None, frames: Frames, keys: np.ndarray
+) -> tuple[np.ndarray | None, float | None]:
+    """Pixels that the detector's mask marks as bad, and its greatest grey value; None of what
+    it does not state. Compares the order of the frames.
+
+    Args:
+        detector: the group; None: of a file that has none.
+        frames: all of the file.
+        keys: the image_key of each.
+
+    Warns:
+        UserWarning: a mask of another size, other values than one number, an underload.
+    """
+    if detector is None:
+        return None, None
+    places = {
+        name: place
+        for name in ("pixel_mask", "sequence_number", *NUMBERS)
+        if (place := there(detector.path, f"{detector.name}/{name}")) is not None
+    }
+    if (place := places.get("sequence_number")) is not None:
+        _check_sequence(place, keys)
+    numbers = {name: _number(places[name]) for name in NUMBERS if name in places}
+    if numbers.get("underload_value", 0) > 0:
+        place = places["underload_value"]
+        warnings.warn(f"{place}: is not applied: values below it are wrong", stacklevel=2)
+    top, bits = (numbers.get(name) for name in ("saturation_value", "bit_depth_readout"))
+    if not top and bits and frames.dtype.kind in "iu":
+        top = min(2.0**bits - 1, float(np.iinfo(frames.dtype).max))
+    place = places.get("pixel_mask")
+    return None if place is None else _mask(place, frames.shape[1:]), top or None
+
+
+def _number(place: Place) -> float:
+    """A number of a detector; 0 of another one, with a warning."""
+    with _unneeded():
+        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+        if len(values) != 1 or not np.isfinite(values[0]):
+            raise Refused(f"{place}: expected one number, got {shown(values.tolist())}")
+        return float(values[0])
+    return 0.0
+
+
+def _mask(place: Place, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Bad pixels by a detector's mask [v u]; None of another one, with a warning."""
+    with _unneeded("; give it as views.bad_pixels"), opened(place.path, EXPECTED) as file:
+        stored = dataset_in(place.path, file, place.name, EXPECTED)
+        if stored.dtype.kind not in "biu" or (*stored.shape[-2:], stored.size) != (
+            *shape,
+            math.prod(shape),
+        ):
+            got = f"{stored.dtype} {stored.shape}"
+            raise Refused(f"{place}: expected a mask of {shape} pixels, got {got}")
+        check_chunks(place.path, stored)
+        return stored[()].reshape(shape) != 0
+    return None
+
+
+@contextmanager
+def _unneeded(cure: str = "") -> Iterator[None]:
+    """Warn of what is refused within, instead of raising, as the views do not need it."""
+    try:
+        yield
+    except Refused as error:
+        warnings.warn(f"{error}; it is not used{cure}", stacklevel=4)
+
+
+def _check_sequence(place: Place, keys: np.ndarray) -> None:
+    """Compare the sequence numbers of frames, counted for all or for each kind, with their order.
+
+    Warns:
+        UserWarning: frames between views are missing, or another number of numbers.
+
+    Raises:
+        Refused: views are not in the order of their numbers.
+    """
+    numbers, views = values_at(place, EXPECTED, ("units",)).ravel(), np.flatnonzero(keys == VIEW)
+    if len(numbers) not in (len(keys), len(views)):
+        warnings.warn(
+            f"{place}: expected a number of each of {len(keys)} frames or {len(views)} views, got "
+            f"{len(numbers)}, which are not used",
+            stacklevel=2,
+        )
+        return
+    own = (numbers[views] if len(numbers) == len(keys) else numbers).astype(float)
+    steps, apart = np.diff(own), np.diff(views)
+    if not steps.any():  # never filled
+        return
+    if (steps <= 0).any():
+        first = int(np.argmax(steps <= 0))
+        raise Refused(
+            f"{place}: expected views in the order of their sequence numbers, got "
+            f"{own[first]:g} and then {own[first + 1]:g}; sort frames and angles by them"
+        )
+    least = (steps[apart == 1] if (apart == 1).any() else steps).min()
+    if (gaps := (steps != least) & (steps != least * apart)).any():
+        first = int(np.argmax(gaps))
+        warnings.warn(
+            f"{place}: {gaps.sum()} gaps between views, such as from {own[first]:g} to "
+            f"{own[first + 1]:g}: frames were dropped, and angles must be those of the others",
+            stacklevel=2,
+        )
