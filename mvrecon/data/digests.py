@@ -100,10 +100,10 @@ def files_in(settings: Any) -> Iterator[str]:
     """
     if isinstance(settings, Mapping):
         for key, value in settings.items():
-            if isinstance(value, str) and (
+            if isinstance(value, str | os.PathLike) and (
                 os.path.isfile(value) or (key == "path" and os.path.isdir(value))
             ):
-                yield value
+                yield os.fspath(value)
         settings = list(settings.values())
     if isinstance(settings, list | tuple):
         for item in settings:
