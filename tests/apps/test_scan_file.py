@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.scan_file import NAME, expanded, save
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.opening import open_projections
 
@@ -154,3 +156,18 @@ def test_a_typo_of_scan_names_it(typed: list[str]):
         expanded(typed)
     with pytest.raises(Refused, match="scan=FOLDER once"):
         expanded(["scan="])
+
+
+@pytest.mark.parametrize("word", ["count_time", "ExposureTime*XRayTubeCurrent", "control/data"])
+def test_an_exposure_by_name_is_no_path(folder: Path, monkeypatch, word: str):
+    """Neither on a command line nor in a description; the name of a file is one."""
+    monkeypatch.chdir(folder)
+    (folder / "count_time.csv").touch()
+    for given, typed, told in (
+        (word, word, word),
+        ("count_time.csv", f"{folder}/count_time.csv", f"{folder}/else/../count_time.csv"),
+    ):
+        settings = absolute_paths({"views": {"exposure": given}}, ReconstructSettings)
+        assert settings["views"]["exposure"] == typed
+        save(folder / "else" / NAME, {"views": {"exposure": given}})
+        assert expanded([f"scan={folder}/else"]) == [f"views.exposure={told}"]

@@ -2,6 +2,7 @@
 by name.
 """
 
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -39,6 +40,8 @@ DETECTOR = {
 #: The time of views in Data Exchange, among them.
 EXCHANGE = "exposure_time"
 KINDS = {**DICOM, **MONITORS, **DETECTOR}
+#: One of these names, or several joined by `*`, in the place of a path.
+EXPOSURE_WORDS = re.compile("({0})([*]({0}))*".format("|".join(map(re.escape, KINDS))))
 #: Attributes of one quantity, by their units.
 UNITS = (
     {"ExposureTime": 1.0, "ExposureTimeInms": 1.0, "ExposureTimeInuS": 1e-3},

@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
+from mvrecon.data.projections.exposures import EXPOSURE_WORDS
 from mvrecon.data.projections.faults import (
     FEWEST_VIEWS,
     SAMPLED_VIEWS,
@@ -112,7 +113,7 @@ class Measured:
     kind: Kind | None = None
     dark: float | str | Path | None = None
     flat: float | str | Path | None = None
-    exposure: str | Path | None = None
+    exposure: str | Annotated[Path, EXPOSURE_WORDS] | None = None
     floor: float = 1e-4
     dead: float = 0.05
     bad_pixels: str | Path | None = None
