@@ -64,8 +64,11 @@ def evaluate(options: EvalSettings, folder: Path) -> Results:
     settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     data = fit.build_data(settings)
 
+    saved: list[Path] = []
+
     def save(scene: Batch, volumes: dict[str, Tensor]) -> None:
-        export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range)
+        where = folder / "cases", scene, volumes, data.grid, data.data_range
+        saved.append(export.save_case(*where, saved))
 
     on_scene = save if options.save else None
     other_rig = bool(options.camera or options.grid)

@@ -463,8 +463,8 @@ def _detector(measured: MeasuredViews) -> dict[str, tuple]:
             f"the direction {(affine[:3, :2] / spacing).T.round(6).tolist()}"
         )
     known = detector_of_image((columns, rows), spacing.tolist(), affine[:2, 3].tolist())
-    (v, u), options = known["offset_mm"], measured.options
-    offset = (v if options.flip_rows else -v, -u if options.flip_columns else u)
+    (v, u), (rows, columns) = known["offset_mm"], measured.flips
+    offset = (v if rows else -v, -u if columns else u)
     return {**known, "offset_mm": offset}
 
 

@@ -9,7 +9,7 @@ found; `mvrecon-reconstruct scan=FOLDER`, or `scan=FILE`, takes it as if it were
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,8 @@ NAME, KEY = "scan.yaml", "scan"
 SECTIONS = ("views", "camera", "projector", "grid")
 #: Options of views that name a data set of their file, or as <file>:<name> one of another.
 DATA_SETS = ("angles", "image_key")
-#: Values: numbers, words or patterns of names, and paths; nothing that refers or computes.
-WORD, NAMED = re.compile(r"[\w.+*?/-]+"), re.compile(r"[\w.+/: -]+")
+#: Values: numbers, words, products of names or patterns of them, and paths; nothing that refers.
+WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
 #: What OmegaConf would resolve, outside of comments.
 REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
 
@@ -38,22 +38,9 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
     working folder, are written as they begin in the file's.
     """
     told = {key: dict(value) for key, value in description.items() if value is not None}
-    told = _with_paths(told, lambda path: _from_folder(file.parent, path))
+    told = with_paths(told, ReconstructSettings, lambda path, _: _from_folder(file.parent, path))
     with written_whole(file) as part:
         part.write_text(yaml.safe_dump(told, sort_keys=False), encoding="utf-8")
-
-
-def _with_paths(
-    told: dict[str, dict[str, Any]], change: Callable[[str], str | Path]
-) -> dict[str, Any]:
-    """Change every path; attributes by which views state their exposure are none."""
-    changed = with_paths(told, ReconstructSettings, lambda path, _: change(path))
-    if isinstance(exposure := told.get("views", {}).get("exposure"), str):
-        from mvrecon.data.projections.exposures import named  # imports torch
-
-        if names := named(exposure):
-            changed["views"]["exposure"] = "*".join(names)
-    return changed
 
 
 def _from_folder(folder: Path, path: str) -> str:
@@ -129,7 +116,7 @@ def _settings(file: Path) -> Iterator[str]:
     for key in {*DATA_SETS} & {*views}:
         if isinstance(name := views[key], str) and ":" not in name:
             views[key] = f"/{name.lstrip('/')}"  # else a file beside this one
-    told = _with_paths(told, lambda path: file.parent / path)
+    told = with_paths(told, ReconstructSettings, lambda path, _: file.parent / path)
     for section, options in told.items():
         if (name := options.pop("name", "from_file")) != "from_file":
             yield f"{section}={_word(file, section, name)}"

@@ -96,7 +96,7 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
         for item in track(range(len(cases)), "Simulating", transient=True, console=console):
             case = cases.sample(item) if item or first is None else first
             index = settings.cases[item]
-            name, mu = case.name, case.maps.get("mu")
+            name, mu = export.numbered(case.name, case_folders), case.maps.get("mu")
             attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
             views, counted = case.views[0], (case.dose, acquisition.duration_s)
             case_folders.append(export.save_views(where, name, views, unit, attenuated, *counted))

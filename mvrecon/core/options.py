@@ -6,6 +6,7 @@ for the keywords of a function or class, a `TypedDict`, or a dataclass of plain 
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
@@ -278,7 +279,8 @@ def with_paths(value: Any, type: Any, change: Callable[[str, bool], str | Path])
     """Change every path within plain data of a type, but not those of callbacks and loggers, which
     are relative to the run's folder.
 
-    A text is a path if the type has `Path`, unless it is one of the type's literals.
+    A text is a path if the type has `Path`, unless it is one of the type's literals, or matches a
+    pattern with which `Path` is annotated.
 
     Args:
         value: to copy.
@@ -289,8 +291,10 @@ def with_paths(value: Any, type: Any, change: Callable[[str, bool], str | Path])
     def changed(value: Any, type: Any) -> Any:
         members = alternatives(type)
         marks = [metadata for member, metadata in members if member is Path]
+        if not isinstance(value, str) or not marks or later(value):
+            return value
         word = any(get_origin(m) is Literal and value in get_args(m) for m, _ in members)
-        if not isinstance(value, str) or not marks or word or later(value):
+        if word or any(isinstance(m, re.Pattern) and m.fullmatch(value) for m in marks[0]):
             return value
         return change(value, WEIGHTS_MARK in marks[0])
 

@@ -42,12 +42,12 @@ class CaseStore:
 
     Args:
         folder: created if missing.
-        made_of: settings of scene and projector and digests of their files, JSON-compatible.
+        made_of: settings of scene and projector and digests of their files: names, numbers, paths.
         scene: its `seed_of(index, seed)` gives the seed on which a case depends.
     """
 
     def __init__(self, folder: str | Path, made_of: Mapping[str, Any], scene: Scene):
-        self.folder, self.made_of = Path(folder), json.dumps(made_of, sort_keys=True)
+        self.folder, self.made_of = Path(folder), json.dumps(made_of, sort_keys=True, default=str)
         self.scene = scene
 
     def __call__(

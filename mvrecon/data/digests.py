@@ -4,6 +4,7 @@ training volumes."""
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from mvrecon.geometry.grid import Grid
 RIG_KEY = "rig"
 #: Significant decimals of a mm, so that processors' different sines give the same rig.
 SIGNIFICANT_DECIMALS = 9
+#: Most bytes of a text header that are searched, and what its lines state behind = or a colon.
+HEADER, STATED = 2**16, re.compile(r"^[^=:\n]*[=:]=?[ \t]*(\S.*?)\s*$", re.MULTILINE)
 
 
 def of_rig(cameras: Cameras) -> str:
@@ -47,17 +50,48 @@ def of_volume(volume: Float[Tensor, "*c d h w"]) -> str:
 
 
 def of_file(path: str | Path) -> str:
-    """Digest of a file's bytes; of a folder, of all files below it with their names.
+    """Digest of a file's bytes, with those of the files that it states as a header, such as the
+    values of .mhd, .hv and .vgi; of a folder, of all files below it, also by links, and their
+    names.
 
     Raises:
         OSError: it cannot be read.
     """
-    if Path(path).is_dir():
-        files = sorted(f for f in Path(path).rglob("*") if f.is_file())
-        digests = {f.relative_to(path).as_posix(): of_file(f) for f in files}
+    path = Path(path)
+    if path.is_dir():
+        digests = {f.relative_to(path).as_posix(): _of_bytes(f) for f in sorted(_below(path))}
         return hashlib.sha256(json.dumps(digests).encode()).hexdigest()
+    if stated := _stated_in(path):
+        whole = [_of_bytes(file) for file in (path, *stated)]
+        return hashlib.sha256(json.dumps(whole).encode()).hexdigest()
+    return _of_bytes(path)
+
+
+def _of_bytes(path: Path) -> str:
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _below(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
+    """The files below a folder, through links, except those that lead back to where it is."""
+    if (real := folder.resolve()) in above:
+        return
+    for item in folder.iterdir():
+        if item.is_dir():
+            yield from _below(item, (*above, real))
+        elif item.is_file():
+            yield item
+
+
+def _stated_in(path: Path) -> list[Path]:
+    """The other files that the lines of a text file state, by their paths from its folder."""
+    with open(path, "rb") as file:
+        head = file.read(HEADER)
+    if b"\0" in head:
+        return []
+    values = STATED.findall(head.decode("utf-8", "surrogateescape"))
+    places = [path.parent / value for value in dict.fromkeys(values)]
+    return [place for place in places if os.path.isfile(place) and place != path]
 
 
 def files_in(settings: Any) -> Iterator[str]:
@@ -66,10 +100,10 @@ def files_in(settings: Any) -> Iterator[str]:
     """
     if isinstance(settings, Mapping):
         for key, value in settings.items():
-            if isinstance(value, str) and (
+            if isinstance(value, str | os.PathLike) and (
                 os.path.isfile(value) or (key == "path" and os.path.isdir(value))
             ):
-                yield value
+                yield os.fspath(value)
         settings = list(settings.values())
     if isinstance(settings, list | tuple):
         for item in settings:

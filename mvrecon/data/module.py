@@ -159,7 +159,7 @@ class SceneData(L.LightningDataModule):
             )
         first, second = self._settings.values()
         given = [scene.get("path") for scene in (first, second)]
-        paths = [Path(path).resolve() for path in given if isinstance(path, str)]
+        paths = [Path(path).resolve() for path in given if path is not None]
         one_file = len(paths) == 2 and paths[0] == paths[1]
         self.shared = first == second or one_file
         self._files = {

@@ -3,8 +3,9 @@
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
+from itertools import count
 from pathlib import Path
 
 import h5py
@@ -34,13 +35,14 @@ def save_case(
     volumes: Mapping[str, Tensor],
     grid: Grid,
     data_range: float,
+    earlier: Iterable[Path] = (),
 ) -> Path:
     """Write one scene: `views.png`, `planes.png`, and with nibabel `truth.nii.gz` and a volume for
     each method.
 
-    Returns the scene's own folder in `folder`.
+    Returns the scene's own folder in `folder`, see `numbered`.
     """
-    case = folder / file_name(scene["name"][0])
+    case = folder / file_name(numbered(scene["name"][0], earlier))
     truth = scene["volume"][0, 0]
     shown = {label: volume[0, 0] for label, volume in volumes.items()}
     save_png(case / "views.png", review.mosaic(scene["views"][0, 0]))
@@ -175,3 +177,12 @@ def check_greys(views: Float[Tensor, "*m v u"]) -> None:
 def file_name(name: str) -> str:
     """The folder name for a case's name."""
     return re.sub(r"[^\w.-]+", "_", name)
+
+
+def numbered(name: str, earlier: Iterable[Path]) -> str:
+    """The name of a case, with _2, _3 ... if its folder would be that of an earlier one, as of
+    "a b" after "a_b", or of patients of one name from two sites.
+    """
+    taken = {folder.name for folder in earlier}
+    names = (f"{name}_{number}" if number > 1 else name for number in count(1))
+    return next(one for one in names if file_name(one) not in taken)

@@ -40,6 +40,7 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.calibration.from_data import Estimate
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Scaled
+from tests.data.projections.test_nikon import xtekct
 from tests.faults.plugins import plugin
 from tests.training.runs import call
 
@@ -58,6 +59,9 @@ SIMULATED = (
     "rtk=true",
 )
 RIG = ("camera=rtk_xml", "camera.detector.pixel_mm=9.0", "camera.world=IEC")
+NIKON = {"Projections": 40, "AngularStep": 9.0, "SrcToObject": 600.0, "SrcToDetector": 900.0}
+NIKON |= {"DetectorPixelsX": 40, "DetectorPixelsY": 36}
+NIKON |= {"DetectorPixelSizeX": 9.0, "DetectorPixelSizeY": 9.0}
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +74,7 @@ def scan(tmp_path_factory):
     shutil.copy(folder / "simulated" / "geometry.xml", folder / "geometry.xml")
     for name in ("truth.nii.gz", "views.h5"):
         shutil.copy(case / name, folder / name)
+    xtekct(folder, Name="view", InputFolderName="projections", **NIKON)
     return folder
 
 
@@ -197,13 +202,19 @@ GREY = (
     "calibrate=[shifts]",
 )
 
+MIRRORED = ("views.path=tooth.xtekct", "grid.like=truth.nii.gz", "calibrate=[offset_u,tilt]")
 
-@pytest.mark.parametrize("typed", [STORED, GREY], ids=["stored", "grey"])
+
+@pytest.mark.parametrize(
+    "typed",
+    [STORED, GREY, MIRRORED, (*MIRRORED, "views.flip_columns=true")],
+    ids=["stored", "grey", "mirrored", "mirrored twice"],
+)
 def test_a_calibrated_scan_is_reconstructed_from_the_file_that_it_writes(
     typed, scan, tmp_path, unchecked, monkeypatch
 ):
     """With nothing typed twice, to the last bit, from another folder; the fit is made up: every
-    detector is turned about three axes and shifted.
+    detector is turned about three axes and shifted. Nikon's images are mirrored without being told.
     """
 
     def calibrated(operator_of, rig, views, free, **_):

@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.scan_file import NAME, expanded, save
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.opening import open_projections
 
@@ -150,8 +152,10 @@ def test_names_of_exposures_are_no_paths(name: str, folder: Path, monkeypatch):
     """Written by hand, also with blanks, or by `save`; a table beside the description is one."""
     (folder / "a.csv").touch()
     expected = [f"views.exposure={folder / name if name == 'a.csv' else name}"]
-    (folder / NAME).write_text(yaml.safe_dump({"views": {"exposure": name.replace("*", " * ")}}))
-    assert expanded([f"scan={folder}"]) == expected
+    blanks = {"views": {"exposure": name.replace("*", " * ")}}
+    (folder / NAME).write_text(yaml.safe_dump(blanks))
+    assert [word.replace(" ", "") for word in expanded([f"scan={folder}"])] == expected
+    assert absolute_paths(blanks, ReconstructSettings) == blanks or name == "a.csv"
     monkeypatch.chdir(folder)
     save(folder / NAME, {"views": {"exposure": name}})
     assert expanded([f"scan={folder}"]) == expected
@@ -171,3 +175,18 @@ def test_a_typo_of_scan_names_it(typed: list[str]):
         expanded(typed)
     with pytest.raises(Refused, match="scan=FOLDER once"):
         expanded(["scan="])
+
+
+@pytest.mark.parametrize("word", ["count_time", "ExposureTime*XRayTubeCurrent", "control/data"])
+def test_an_exposure_by_name_is_no_path(folder: Path, monkeypatch, word: str):
+    """Neither on a command line nor in a description; the name of a file is one."""
+    monkeypatch.chdir(folder)
+    (folder / "count_time.csv").touch()
+    for given, typed, told in (
+        (word, word, word),
+        ("count_time.csv", f"{folder}/count_time.csv", f"{folder}/else/../count_time.csv"),
+    ):
+        settings = absolute_paths({"views": {"exposure": given}}, ReconstructSettings)
+        assert settings["views"]["exposure"] == typed
+        save(folder / "else" / NAME, {"views": {"exposure": given}})
+        assert expanded([f"scan={folder}/else"]) == [f"views.exposure={told}"]

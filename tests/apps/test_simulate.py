@@ -292,3 +292,18 @@ def test_the_app_works_in_unusual_paths(root, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert len(list(out.rglob("views.h5"))) == 1 and not list(here.iterdir())
+
+
+def test_cases_whose_folders_would_be_one_keep_their_files(tmp_path):
+    """Patients named "a b", "a_b" and "a(b": each has its own views and truth."""
+    grid = Grid.centred(16, spacing=8.0)
+    for hu, name in enumerate(("a b", "a_b", "a(b")):
+        volume = torch.full(grid.shape, -1000.0)
+        volume[4:12, 4:12, 4:12] = 100.0 * hu
+        save_volume(tmp_path / "in" / f"{name}.nii.gz", volume, grid)
+    given = "scene=volumes", f"scene.path={tmp_path / 'in'}", "cases=[0,1,2]", *GRID, *PARALLEL
+    call(tmp_path / "run", *given)
+    cases = sorted((tmp_path / "run" / "cases").iterdir())
+    assert [case.name for case in cases] == ["a_b", "a_b_2", "a_b_3"]
+    tops = [read_volume(case / "truth.nii.gz")[0].max().item() for case in cases]
+    assert sorted(tops) == pytest.approx([0.0, 100.0, 200.0], abs=1.0)

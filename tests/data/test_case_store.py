@@ -149,3 +149,27 @@ def test_a_run_reuses_stored_cases_and_worker_processes_generate_the_same(
     assert len(list(folder.iterdir())) == 4
     monkeypatch.setattr(Acquired, "ideal", None)  # must not be called
     assert torch.equal(views(cache=str(folder), seed=7), expected), "no case depends on the seed"
+
+
+def test_cases_of_values_beside_their_header_are_regenerated_when_these_change(tmp_path):
+    """A MetaImage .mhd, whose values are in a file of their own."""
+    itk = pytest.importorskip("SimpleITK")
+    scenes = dict.fromkeys(
+        ("train", "test"), {"name": "volumes", "path": str(tmp_path / "ct.mhd"), "crop": "none"}
+    )
+    measurement = {"grid": {"shape": [6, 6, 6], "spacing": 8.0}, "camera": RIG}
+    sizes = {"train": 1, "val": 1, "test": 1}
+
+    def truth(hu):
+        values = torch.full((12, 12, 12), -1000.0)
+        values[3:9, 3:9, 3:9] = hu
+        image = itk.GetImageFromArray(values.numpy())
+        image.SetSpacing([4.0] * 3)
+        image.SetOrigin([-22.0] * 3)
+        itk.WriteImage(image, str(tmp_path / "ct.mhd"))
+        cache = str(tmp_path / "cases")
+        data = SceneData(scenes, measurement, sizes, overlap=True, cache=cache)
+        data.setup("test")
+        return data.sets["test"].prepare()["volume"].max().item()
+
+    assert truth(1000.0) > 1.5 * truth(0.0)

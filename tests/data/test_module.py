@@ -57,6 +57,16 @@ def test_a_file_is_split_without_overlap(volume_file):
     assert sorted(sets["train"]) == ["pt_1", "pt_2", "pt_3", "pt_4"]
 
 
+def test_a_path_object_names_a_file_as_its_text_does(volume_file, tmp_path):
+    """One file with other options for the test is split, known by its digest, and cached."""
+    scenes = {"train": {"name": "hdf5", "path": volume_file}}
+    scenes["test"] = scenes["train"] | {"rays": 1}
+    sizes = {"train": 9, "val": 2, "test": 3}
+    data = SceneData(scenes, MEASUREMENT, sizes, cache=str(tmp_path / "cases"))
+    assert disjoint(parts(data)) and len(list((tmp_path / "cases").iterdir())) == 7
+    assert str(volume_file) in data.digests("test")
+
+
 def test_asking_for_more_test_cases_never_takes_training_cases(volume_file):
     heads = {"name": "hdf5", "path": str(volume_file)}
     trained = set(build(heads, test=0).indices("train"))

@@ -1,5 +1,6 @@
 """A run knows its rig and its data by digest, and refuses others."""
 
+import hashlib
 import json
 import os
 from dataclasses import replace
@@ -100,3 +101,41 @@ def test_a_file_digest_depends_on_its_contents(tmp_path):
         Refused, match=r"according to run: .*a\.h5: got sha256 [0-9a-f]{16}, expected [0-9a-f]{16}"
     ):
         digests.compare({str(path): digests.of_file(path)}, before, "run")
+
+
+@pytest.mark.parametrize(
+    ("header", "line"),
+    [
+        ("ct.mhd", "ElementDataFile = values/ct one.raw"),
+        ("ct.vgi", "[file1]\nSize = 2 2 2\nName=values/ct one.raw\r"),
+        ("mu.hv", "!INTERFILE :=\n!name of data file := values/ct one.raw\n!END OF INTERFILE :="),
+    ],
+)
+def test_the_digest_of_a_header_depends_on_the_values_that_it_states(tmp_path, header, line):
+    """Of MetaImage, VGStudio and Interfile; not on other files beside it, nor of a file that
+    holds its own values, whose bytes may look like lines.
+    """
+    path, values = tmp_path / header, tmp_path / "values" / "ct one.raw"
+    values.parent.mkdir()
+    path.write_bytes(line.encode())
+    values.write_bytes(b"first")
+    before = digests.of_file(path)
+    (tmp_path / "other.raw").write_bytes(b"new")
+    assert digests.of_file(path) == before
+    values.write_bytes(b"other")
+    assert digests.of_file(path) != before
+    path.write_bytes(b"\0" + line.encode())
+    assert digests.of_file(path) == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_the_digest_of_a_folder_depends_on_what_its_links_lead_to(tmp_path):
+    """A folder of links to patients elsewhere, one of which leads back to it."""
+    folder, patient = tmp_path / "patients", tmp_path / "archive" / "1"
+    folder.mkdir()
+    patient.mkdir(parents=True)
+    (patient / "slice").write_bytes(b"first")
+    (folder / "a").symlink_to(patient)
+    (patient / "all").symlink_to(folder)
+    before = digests.of_file(folder)
+    (patient / "slice").write_bytes(b"other")
+    assert digests.of_file(folder) != before

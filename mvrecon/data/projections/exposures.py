@@ -2,6 +2,7 @@
 by name.
 """
 
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -49,6 +50,9 @@ EXCHANGE = "exposure_time"
 #: Of each attenuator in an instrument of NeXus, behind the path of its group.
 ATTENUATOR = "attenuator_transmission"
 KINDS = {**DICOM, **DECTRIS, **EDF, **MONITORS, **DETECTOR}
+NAME = "|".join([*map(re.escape, KINDS), rf"[\w./-]+/{ATTENUATOR}"])
+#: One of these names, or several joined by `*`, in the place of a path.
+EXPOSURE_WORDS = re.compile(rf" *({NAME})( *[*] *({NAME}))* *")
 #: Attributes of one quantity, by their units.
 UNITS = (
     {"ExposureTime": 1.0, "ExposureTimeInms": 1.0, "ExposureTimeInuS": 1e-3},

@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
+from mvrecon.data.projections.exposures import EXPOSURE_WORDS
 from mvrecon.data.projections.faults import (
     FEWEST_VIEWS,
     SAMPLED_VIEWS,
@@ -113,7 +114,7 @@ class Measured:
     kind: Kind | None = None
     dark: float | str | Path | None = None
     flat: float | str | Path | None = None
-    exposure: str | Path | None = None
+    exposure: str | Annotated[Path, EXPOSURE_WORDS] | None = None
     floor: float = 1e-4
     dead: float = 0.05
     bad_pixels: str | Path | None = None
@@ -206,7 +207,6 @@ class MeasuredViews:
         stack = open_projections(
             options.path, options.pattern, options.gaps, own, options.layout, **names
         )
-        options = replace(options, flip_columns=options.flip_columns != stack.mirrored)
         self.options, self.stack = options, stack
         self.region = Region(stack.shape, options.rows, options.columns, options.binning)
         whole = stack.dtype.kind != "f"
@@ -262,6 +262,11 @@ class MeasuredViews:
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
         return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)
+
+    @property
+    def flips(self) -> tuple[bool, bool]:
+        """Whether the rows and the columns on disk are reversed."""
+        return self.options.flip_rows, self.options.flip_columns != self.stack.mirrored
 
     @property
     def names(self) -> list[str]:
@@ -459,8 +464,10 @@ class MeasuredViews:
             )
         if count := int(bad.sum()):
             rows, columns = range(self.stack.shape[0]), range(self.stack.shape[1])
-            rows = rows[::-1] if self.options.flip_rows else rows
-            columns = columns[::-1] if self.options.flip_columns else columns
+            rows, columns = (
+                way[::-1] if flip else way
+                for way, flip in zip((rows, columns), self.flips, strict=True)
+            )
             places = in_words(bad, rows[top:bottom], columns[left:right])
             warnings.warn(
                 f"{where}: {count} of {bad.numel()} pixels are dead, hot or stuck ({places}); they "
@@ -522,8 +529,7 @@ class MeasuredViews:
 
     def _kept(self, raw: Tensor) -> Tensor:
         """The region's rows and columns of pixels on disk, in the cameras' order."""
-        reversed_axes = {-2: self.options.flip_rows, -1: self.options.flip_columns}
-        return self.region.cropped(raw.flip([axis for axis, yes in reversed_axes.items() if yes]))
+        return self.region.cropped(raw.flip([axis - 2 for axis in (0, 1) if self.flips[axis]]))
 
     def warn_of_values(self, odd: Counter[str]) -> None:
         """Warn of pixels that were saturated, at the floor or bright in a single view, if any, and

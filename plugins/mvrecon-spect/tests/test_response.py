@@ -1,10 +1,13 @@
 """Responses by the angle of incidence, and measured ones, against closed forms and Monte Carlo."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
+from mvrecon.apps.config import absolute_paths
+from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.operators.projector import Spect
@@ -132,3 +135,13 @@ def test_impossible_tables_are_refused(tmp_path, text, told):
 def test_a_response_needs_blur():
     with pytest.raises(ValueError, match="blur=True"):
         Spect(Grid.centred(4, spacing=2.0, centre=(0, 0, 100)), pinhole(9), response=CRYSTAL)
+
+
+def test_the_word_geometric_is_no_path_and_a_table_is_one():
+    for response, found in (
+        ("geometric", "geometric"),
+        ("a.csv", str(Path("a.csv").absolute())),
+    ):
+        projector = {"name": "spect", "blur": True, "response": response}
+        settings = absolute_paths({"projector": projector}, ReconstructSettings)
+        assert settings["projector"]["response"] == found

@@ -225,10 +225,12 @@ GRID = mv.Grid.centred(size=(4, 5, 6), spacing=(1.0, 2.0, 3.0), centre=(40.0, -4
         (write_interfile_volume, " a.hv", 1.0, "without blanks"),
         (write_nm, "a.dcm", 1e300, "greatest of float32"),
         (write_nm, "a.dcm", 1e-40, "16 bits with a slope"),
+        (write_nm, "a.dcm", 3e38, "16 bits with a slope"),  # of both signs
     ],
 )
 def test_contents_that_are_refused(write, name, value, message, tmp_path: Path):
     x = torch.full(GRID.shape, value, dtype=torch.float64)
+    x[0] *= -1
     with pytest.raises(ValueError, match=message):
         write(tmp_path / name, x, GRID)
     assert not list(tmp_path.iterdir())

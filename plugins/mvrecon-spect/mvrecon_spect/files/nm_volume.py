@@ -107,8 +107,9 @@ def write_nm(
     Raises:
         ImportError: pydicom is not installed.
         Refused: `like` is not a DICOM image.
-        ValueError: a volume with values that are not finite or too small for a slope in float32, or
-            a grid whose axes are not orthogonal; see `mvrecon.data.resample.storable`.
+        ValueError: a volume with values that are not finite, or too small or too far apart for a
+            slope in float32, or a grid whose axes are not orthogonal; see
+            `mvrecon.data.resample.storable`.
     """
     values = storable(path, volume, grid)[0].astype(np.float64)
     if not np.isfinite(values).all():
@@ -117,7 +118,7 @@ def write_nm(
     values, corner, axes = _as_seen(values, grid)
     low, high = min(0.0, values.min()), values.max()
     slope = (high - low) / 65535 or 1.0
-    if slope < np.finfo(np.float32).tiny:
+    if slope < np.finfo(np.float32).tiny or high - low > np.finfo(np.float32).max:
         raise ValueError(
             f"{path}: expected values that 16 bits with a slope of float32 hold, got {low:g} to "
             f"{high:g}; divide the volume by a unit of its own"

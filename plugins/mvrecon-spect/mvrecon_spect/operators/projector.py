@@ -16,7 +16,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
 
 import torch
@@ -33,7 +32,7 @@ from mvrecon.operators.selection import check_support
 from mvrecon_spect.operators.footprints import Footprints, pixel_in_voxels
 from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.matter import CaseAttenuation, Matter, MuOption, attenuation_on
-from mvrecon_spect.operators.response import response_of
+from mvrecon_spect.operators.response import ResponseOption, response_of
 
 #: The methods: footprints of voxels, and the thin ray of each pixel.
 FOOTPRINTS, THIN = "footprints", "joseph"
@@ -56,7 +55,7 @@ class Shared(TypedDict, total=False):
         sensitivity: formula for the effective diameter, "anger" or "paix", see `Hole`.
     """
 
-    response: str | Path | Mapping[str, Any]
+    response: ResponseOption
     method: Literal["footprints", "joseph"]
     backend: str
     skip: str

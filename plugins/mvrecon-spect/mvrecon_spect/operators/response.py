@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -55,7 +55,7 @@ class Response:
         return [value for part in parts for value in part]
 
 
-ResponseOption = str | Path | Mapping[str, Any]
+ResponseOption = Literal["geometric"] | str | Path | Mapping[str, Any]
 
 #: Angles at which parts of a response are evaluated, between the axis and a detector's corner.
 ANGLES = 33
