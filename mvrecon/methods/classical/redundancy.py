@@ -235,10 +235,9 @@ class _Branches:
         places = (torch.arange(count, dtype=torch.float64) + 0.5) * step
         usual = _usual(_gaps(angles))
         most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
-        even = min(usual, _even(_gaps(angles)))
+        named = min(most, min(usual, _even(_gaps(angles))) + NAMED_GAP)
         measured, near = (
-            _covered(angles, places, edge > 0, gap, step)
-            for gap, step in ((most, usual), (min(most, even + NAMED_GAP), even))
+            _covered(angles, places, edge > 0, gap, min(usual, gap)) for gap in (most, named)
         )
         edge = edge.clamp_min(0)
         index = (angles / step).long().clamp_max(count - 1).expand_as(edge)
