@@ -143,7 +143,7 @@ def test_voxels_beside_the_common_slab_of_a_helix_are_named():
 
 SHORT_CONES = {
     "whole turn": ({}, {}),
-    "raised": ({"offset_mm": [40.0, 0.0]}, {}),
+    "raised": ({"offset_mm": [20.0, 0.0]}, {}),
     "half fan": ({"offset_mm": [0.0, 100.0]}, {}),
     "short scan": ({}, {"arc_degrees": 250.0}),
 }
