@@ -214,7 +214,8 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     seen = grouped(used)
     ends, nexts = (divided(grouped(x * used), seen, -math.inf) for x in (ends, nexts))
     most, top = (grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
-    air = _air(*(torch.where(seen > 0, x, torch.nan) for x in (ends, nexts)), top)
+    known, beside = (torch.where(seen > 0, x, torch.nan) for x in (ends, nexts))
+    air = _air(known, beside, top)
     noise = grouped(noise) / math.sqrt(edges.shape[1] // count)
     cut = (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)  # [g k i]
     views = cut.double().mean(dim=0)
