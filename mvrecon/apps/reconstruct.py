@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 ARC_OPTION = "arc_degrees"
 #: Ends the warning of a scan that sees little of the grid.
 SMALLER_GRID_HINT = (
-    "without grid.* the grid is what all views see, and with grid.seen_by=0.5 alone what half of "
-    "them see"
+    "without grid.* the grid is what all views see, or of a half fan what they measure together, "
+    "and with grid.seen_by=0.5 alone what half of them see"
 )
 
 

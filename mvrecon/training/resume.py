@@ -87,9 +87,11 @@ class KeepLast(Checkpoint):
 
 class AveragedWeights(EMAWeightAveraging):
     """Lightning's exponential moving average of the weights, which also stores the last averaged
-    epoch.
+    epoch, and leaves the trained weights beside the averages when the training ends.
 
     A checkpoint of an epoch's last step precedes the epoch's end, which a resumed Lightning skips.
+    One of a finished training has the averages as its weights, like any other, and the trained ones
+    beside them, from which a training to more steps continues.
     """
 
     def state_dict(self) -> dict[str, Any]:
@@ -108,6 +110,9 @@ class AveragedWeights(EMAWeightAveraging):
             assert self._average_model is not None
             self._average_model.update_parameters(pl_module)
             self._latest_update_epoch = last
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Keep the trained weights, which Lightning would replace by the averages."""
 
 
 class RandomStates(TypedDict):

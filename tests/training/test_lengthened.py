@@ -57,6 +57,25 @@ def test_a_finished_run_continues_to_more_steps_as_if_never_finished(short, tmp_
     assert rows[0][METHOD]["psnr"]["values"] == rows[1][METHOD]["psnr"]["values"]
 
 
+@pytest.mark.parametrize("end", [SHORT, 10])
+def test_averages_continue_from_the_trained_weights(end, tmp_path):
+    """With averages of every other step, a run that ended within an epoch or at its end and is
+    continued has the averages, the trained weights and the counters of one of that length. The
+    trained weights used to begin again at the averages.
+    """
+    options = [*PLAIN, "callbacks=ema", "+callbacks.ema.update_every_n_steps=2"]
+    folders = {"run": end, "whole": LONG}
+    for name, count in folders.items():
+        settings = TrainSettings(**compose(*options, *steps(count, "constant")))
+        mvrecon.apps.train.train(settings, tmp_path / name)
+    ended = checkpoints.read(checkpoints.finished(tmp_path / "run", METHOD))
+    assert not same(ended["state_dict"], ended["current_model_state"])
+    assert call(mvrecon.apps.train, f"resume={tmp_path}/run", f"trainer.max_steps={LONG}") == 0
+    run, whole = (checkpoints.read(checkpoints.finished(tmp_path / n, METHOD)) for n in folders)
+    for key in ("state_dict", "current_model_state", "averaging_state"):
+        assert same(run[key], whole[key]), key
+
+
 def test_a_run_can_only_be_lengthened(short, capsys):
     """A run is not resumed to fewer steps or with any other setting, and its table
     stays.

@@ -18,14 +18,17 @@ from mvrecon.geometry.cameras.field import half_fan
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.methods.classical.orbit import along, warn_of_axial_errors
+from mvrecon.methods.classical.orbit import along, beyond_rows, warn_of_axial_errors
 from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
 from mvrecon.methods.classical.truncation import (
+    CUT_EDGE,
     PARTS,
     ROW_BLOCKS,
     continuation,
+    edge_shares,
     edges_of,
+    ends_of,
     truncated,
     warn_of_truncation,
 )
@@ -188,6 +191,7 @@ class FilterPlan:
         beyond: these columns.
         images: of all voxels in the filtered views.
         pixels: of a filtered view.
+        beyond_rows: the voxels that rows of views do not reach, in words; None: few.
     """
 
     rig: Cameras
@@ -197,6 +201,7 @@ class FilterPlan:
     beyond: int
     images: Images
     pixels: int
+    beyond_rows: str | None
 
     def to(self, device: torch.device) -> "FilterPlan":
         """Move to a device."""
@@ -207,7 +212,7 @@ class FilterPlan:
 
     def filtered(
         self, views: Float[Tensor, "b c k v u"], part: slice
-    ) -> tuple[Tensor, Float[Tensor, "b c k 7 i"]]:
+    ) -> tuple[Tensor, Float[Tensor, "b c k 10 i"]]:
         """Weight and filter a part of the views, a few at a time; also returns their `edges_of`."""
         volumes, rows = views.shape[0] * views.shape[1], views.new_empty(0)
         edges = views.new_empty(*views.shape[:3], sum(PARTS), min(ROW_BLOCKS, views.shape[3]))
@@ -254,7 +259,8 @@ def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
         beyond = max(cameras.shape[1], before, behind)
         longer = ramp_response(target.shape[1] + beyond, *window)
     images = Images(image_maps(target, grid), target.ray_extent, grid.shape)
-    return FilterPlan(rig, scan, response, longer, beyond, images, math.prod(target.shape))
+    low = beyond_rows(rig, scan.orbit, grid)
+    return FilterPlan(rig, scan, response, longer, beyond, images, math.prod(target.shape), low)
 
 
 #: Deviation of a source's distance from the axis, relative to its mean, from which on a half fan
@@ -318,15 +324,17 @@ def filtered_backprojection(
         )
     plan = _known(cameras, grid, filtering, cameras.source, lambda: _plan(cameras, grid, filtering))
     size = max(1, BLOCK_PIXELS // (volumes * plan.pixels))
-    total, edges = None, []
+    total, edges, ends = None, [], []
     for part in _slices(0, len(cameras), size):
         views = read(part.start, part.stop)
         check_views(views, cameras[part])
         check_floating(views, "views")
         near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
         images = near.images._replace(maps=near.images.maps[part])
-        filtered, ends = near.filtered(to_accumulation_dtype(views), part)
-        edges.append(ends)
+        filtered, sides = near.filtered(to_accumulation_dtype(views), part)
+        edges.append(sides)
+        if plan.beyond_rows and views.is_cpu:
+            ends.append(ends_of(to_accumulation_dtype(views.detach())))
         if total is None:
             total = backproject_images(filtered, images, weighted=True)
         elif torch.is_grad_enabled():
@@ -336,7 +344,16 @@ def filtered_backprojection(
     assert total is not None  # a rig has at least one camera
     if edges[0].is_cpu:  # a GPU would have to be waited for
         warn_of_truncation(torch.cat(edges, dim=2), filtering.extrapolate)
+    # all that a single row sees extends beyond it, and a GPU would have to be waited for
+    known = ends and cameras.shape[0] > 1
+    if plan.beyond_rows and not (known and _ends_within_rows(torch.cat(ends, dim=2))):
+        warnings.warn(plan.beyond_rows, stacklevel=2)
     return total
+
+
+def _ends_within_rows(ends: Float[Tensor, "b c m 2 10 i"]) -> bool:
+    """Whether objects do not reach the first and the last row of the views."""
+    return not (edge_shares(ends)[:, 0] > CUT_EDGE).any()
 
 
 def fdk_streamed(

@@ -178,12 +178,11 @@ def _check_rows(cameras: Cameras, orbit: Orbit) -> None:
 
 
 def warn_of_axial_errors(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
-    """Warn of values that filtered back-projection reads low or high along the axis.
+    """Warn of objects that filtered back-projection reads low or high by their height.
 
-    Objects a times as wide as high lose 1 - (1 + (a tan(tilt))^2)^-1/2, where the rays are tilted
+    Those a times as wide as high lose 1 - (1 + (a tan(tilt))^2)^-1/2, where the rays are tilted
     against the orbit's plane, as in laminography, and gain (1 + (a tan(roll))^2)^1/2 - 1, where the
-    rows are. Voxels lose the share of the views whose rows do not reach them, as those beside the
-    slab that all views of a helix have in common.
+    rows are.
     """
     back = cameras.origin if cameras.parallel else grid.centre.to(cameras.source)
     rays = unit(cameras.source - back)
@@ -204,6 +203,15 @@ def warn_of_axial_errors(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
                 f"{flat:.0%}; use sirt",
                 stacklevel=2,
             )
+
+
+def beyond_rows(cameras: Cameras, orbit: Orbit, grid: Grid) -> str | None:
+    """Which voxels rows of views do not reach, in words; None if these are few.
+
+    A voxel of an object that extends beyond these rows loses the share of these views: at the top
+    and the bottom of a box near the sources, and beside the slab that all views of a helix have in
+    common. One that all views see whole loses nothing.
+    """
     counts = [min(n, MAX_COARSE_VOXELS) for n in grid.size]
     places = [
         (torch.arange(k) + 0.5) * (n / k) - 0.5 for n, k in zip(grid.size, counts, strict=True)
@@ -214,21 +222,21 @@ def warn_of_axial_errors(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
     inside = across - (across @ orbit.axis)[:, None] * orbit.axis
     centres = centres[inside.norm(dim=-1) <= radius]
     if not len(centres):
-        return
+        return None
     rows = cameras.project(centres)[..., 1]
     losses = ((rows < -0.5) | (rows > cameras.shape[0] - 0.5)).double().mean(dim=0)
     share = (losses > WARNED_LOSS).double().mean().item()
-    if share > WARNED_VOXELS:
-        along = (centres - grid.centre.to(centres)) @ orbit.axis
-        whole = along[losses <= WARNED_LOSS]
-        where = f"from {whole.min():.3g} to {whole.max():.3g} mm" if len(whole) else "nowhere"
-        warnings.warn(
-            f"{share:.0%} of the voxels in the grid's inscribed cylinder are above or below the "
-            f"rows of some views, and FDK reads them low, by up to {losses.max():.0%}; voxels that "
-            f"all views reach are {where} along the axis, from the grid's centre. Take a lower "
-            f"grid, or use sirt",
-            stacklevel=2,
-        )
+    if share <= WARNED_VOXELS:
+        return None
+    along = (centres - grid.centre.to(centres)) @ orbit.axis
+    whole = along[losses <= WARNED_LOSS]
+    where = f"from {whole.min():.3g} to {whole.max():.3g} mm" if len(whole) else "nowhere"
+    return (
+        f"{share:.0%} of the voxels in the grid's inscribed cylinder are above or below the rows "
+        f"of some views, and FDK reads an object that extends beyond these rows low there, by up "
+        f"to {losses.max():.0%}; voxels that all views reach are {where} along the axis, from the "
+        f"grid's centre. Take a lower grid, or use sirt"
+    )
 
 
 def fan_coordinate(

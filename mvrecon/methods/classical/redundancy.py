@@ -35,8 +35,9 @@ FAN_DISTANCES, MIN_ANGLES, ANGLES_PER_VIEW = 128, 1440, 4
 GAP_STEPS, MIN_GAP, MAX_STEP_ANGLE = 5.0, math.radians(2.0), math.radians(125.0)
 #: Views closer than this part of the usual step are exposures at one angle, and share its cell.
 EXPOSURE_STEP_SHARE = 0.2
-#: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step.
-NAMED_GAP = math.radians(8.0)
+#: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step
+#: and than an even one. Views within the second angle are exposures of one, as encoders repeat it.
+NAMED_GAP, SAME_ANGLE = math.radians(8.0), math.radians(0.01)
 #: The usual step is the least one such that steps up to it make up this part of the measured arc.
 USUAL_STEP_SHARE = 0.3
 #: A line that no ray measures is replaced by views within this angle, or within so many steps.
@@ -207,7 +208,7 @@ class _Branches:
         level: the same of the lines that its neighbours measure, too.
         measured: whether views of this branch or of its conjugate measure the line, a gap of a few
             steps between them included.
-        near: the same without gaps that are wide in degrees.
+        near: the same without gaps that are wide in degrees, or wide for so many views.
     """
 
     q: Float[Tensor, " q"]
@@ -234,9 +235,9 @@ class _Branches:
         places = (torch.arange(count, dtype=torch.float64) + 0.5) * step
         usual = _usual(_gaps(angles))
         most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
+        named = min(most, min(usual, _even(_gaps(angles))) + NAMED_GAP)
         measured, near = (
-            _covered(angles, places, edge > 0, gap, usual)
-            for gap in (most, min(most, usual + NAMED_GAP))
+            _covered(angles, places, edge > 0, gap, min(usual, gap)) for gap in (most, named)
         )
         edge = edge.clamp_min(0)
         index = (angles / step).long().clamp_max(count - 1).expand_as(edge)
@@ -401,6 +402,14 @@ def _usual(gaps: Float[Tensor, " m"]) -> float:
     if not len(steps):
         return MAX_STEP_ANGLE
     return steps[torch.searchsorted(steps.cumsum(0), USUAL_STEP_SHARE * steps.sum())].item()
+
+
+def _even(gaps: Float[Tensor, " m"]) -> float:
+    """The step of as many views, spread evenly over the measured arc; smaller than the usual one
+    where views are clustered.
+    """
+    steps = gaps[(gaps <= MAX_STEP_ANGLE) & (gaps > SAME_ANGLE)]
+    return steps.mean().item() if len(steps) else MAX_STEP_ANGLE
 
 
 def _conjugate(

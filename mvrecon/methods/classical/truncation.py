@@ -21,8 +21,9 @@ from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided, second_differences
 #: Share of a row at its end to which the ellipse is fitted, with the least number of columns, and
 #: the share whose mean is the value at the edge.
 FITTED, MIN_FITTED, EDGE = 0.2, 16, 0.02
-#: The share that tells whether the object reaches the edge: one that ends just inside does not.
-OUTERMOST = 0.01
+#: The share that tells whether the object reaches the edge: one that ends just inside does not; and
+#: how many times as many columns beside it tell whether the edge is flat, as air is.
+OUTERMOST, BESIDE = 0.01, 3
 #: Greatest growth of p^2 beyond the edge, relative, where the ellipse's centre is beyond it.
 MAX_GROWTH = 4.0
 #: Blocks of rows, and groups of consecutive views, over which the edges of views are averaged.
@@ -39,17 +40,20 @@ CONTINUED_EDGE = 0.1
 #: Standard deviations of noise beyond which an edge shows an object, and the share of the views
 #: that show one from which a warning is given.
 MIN_DEVIATIONS, WARNED_VIEWS = 3.0, 0.1
+#: What air reads is the lower quartile of the edges, up to a flat field that is a tenth off, and
+#: less than this part of the greatest line integral.
+AIR_QUANTILE, MAX_AIR, MAX_AIR_SHARE = 0.25, 0.1, 0.5
 #: Numbers of the parts of `edges_of`.
-PARTS = [2, 2, 1, 1, 1]
+PARTS = [2, 2, 2, 1, 1, 2]
 
 
 def edges_of(
     views: Float[Tensor, "b c k v u"], weights: Float[Tensor, "k #v #u"] | None = None
-) -> Float[Tensor, "b c k 7 i"]:
+) -> Float[Tensor, "b c k 10 i"]:
     """What tells whether views end inside the object, in the order of `PARTS`, averaged over blocks
-    of rows: the first and the last columns, beyond a standard deviation of noise; their weights
-    relative to the view's greatest; the greatest column, at most `MAX_LEVEL` times the mean, and as
-    it is; and that deviation.
+    of rows: the first and the last columns; the columns beside them; their weights relative to the
+    view's greatest; the greatest column, at most `MAX_LEVEL` times the mean, and as it is; and the
+    standard deviation of the first and the last columns' noise.
 
     Args:
         views: line integrals.
@@ -59,10 +63,18 @@ def edges_of(
     blocks = min(ROW_BLOCKS, views.shape[-2])
     means = torch.stack([part.mean(dim=-2) for part in views.tensor_split(blocks, dim=-2)], dim=-1)
     count = max(1, round(OUTERMOST * views.shape[-1]))
-    ends = torch.stack([means[..., :count, :], means[..., -count:, :]], dim=-3).mean(dim=-2)
-    noise = torch.zeros_like(ends[..., :1, :])
+    more = BESIDE * count
+    columns = (means[..., :count, :], means[..., -count:, :])
+    beside = (means[..., count:, :][..., :more, :], means[..., :-count, :][..., -more:, :])
+    ends = torch.stack([part.mean(dim=-2) for part in columns], dim=-2)
+    nexts = ends
+    noise = torch.zeros_like(ends)
     if views.shape[-1] > 2:
-        rest = second_differences(means, dim=-2).abs().median(dim=-2, keepdim=True).values
+        nexts = torch.stack([part.mean(dim=-2) for part in beside], dim=-2)
+        rest = second_differences(means, dim=-2).abs()
+        some = max(MIN_FITTED, round(FITTED * views.shape[-1]))
+        sides = (rest[..., :some, :], rest[..., -some:, :])
+        rest = torch.stack([part.median(dim=-2).values for part in sides], dim=-2)
         noise = SIGMA_PER_MEDIAN * rest / math.sqrt(count)
     shares = torch.ones_like(ends)
     if weights is not None:
@@ -70,10 +82,10 @@ def edges_of(
         shares = shares * divided(sides, weights.amax(dim=(-2, -1))[:, None])[..., None]
     greatest = means.amax(dim=-2, keepdim=True)
     level = torch.minimum(greatest, MAX_LEVEL * means.mean(dim=-2, keepdim=True))
-    return torch.cat([ends - noise, shares, level, greatest, noise], dim=-2)
+    return torch.cat([ends, nexts, shares, level, greatest, noise], dim=-2)
 
 
-def ends_of(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m 2 7 i"]:
+def ends_of(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m 2 10 i"]:
     """`edges_of` the columns of views, at their first and last row, and of their rows; zero where
     these have one pixel.
     """
@@ -84,12 +96,12 @@ def ends_of(views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c m 2 7 i"]:
     return torch.stack(ends, dim=3)
 
 
-def edge_shares(ends: Float[Tensor, "b c m 2 7 i"]) -> Float[Tensor, "b 2 2"]:
-    """The edges of views relative to their greatest values, in the mean over all views: of the
-    first and the last row, and of the first and the last column.
+def edge_shares(ends: Float[Tensor, "b c m 2 10 i"]) -> Float[Tensor, "b 2 2"]:
+    """The edges of views beyond a standard deviation of noise relative to their greatest values, in
+    the mean over all views: of the first and the last row, and of the first and the last column.
     """
-    edges, _, level, _, _ = ends.mean(dim=2).split(PARTS, dim=-2)
-    return divided(edges.amax(dim=(1, 4)), level.amax(dim=(1, 4)))
+    edges, _, _, level, _, noise = ends.mean(dim=2).split(PARTS, dim=-2)
+    return divided((edges - noise).amax(dim=(1, 4)), level.amax(dim=(1, 4)))
 
 
 def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
@@ -97,10 +109,10 @@ def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
     return edge_shares(ends_of(views)) > CUT_EDGE
 
 
-def truncated(edges: Float[Tensor, "b c k 7 i"]) -> Bool[Tensor, "b c k 1 1"]:
+def truncated(edges: Float[Tensor, "b c k 10 i"]) -> Bool[Tensor, "b c k 1 1"]:
     """Whether views end inside the object, so that their rows are continued."""
-    ends, shares, level, _, _ = edges.split(PARTS, dim=-2)
-    cut = (ends * shares).amax(dim=(-2, -1)) > CONTINUED_EDGE * level.amax(dim=(-2, -1))
+    ends, _, shares, level, _, noise = edges.split(PARTS, dim=-2)
+    cut = ((ends - noise) * shares).amax(dim=(-2, -1)) > CONTINUED_EDGE * level.amax(dim=(-2, -1))
     return cut[..., None, None]
 
 
@@ -160,14 +172,36 @@ def _parabola(
     return value, slope + 2 * curvature * end, curvature
 
 
-def warn_of_truncation(edges: Float[Tensor, "b c m 7 i"], extrapolate: bool) -> None:
+def _air(
+    ends: Float[Tensor, "g k n i"], nexts: Float[Tensor, "g k n i"], top: Float[Tensor, "k 1 1"]
+) -> Float[Tensor, "k n 1"]:
+    """What air reads at each side: what the lowest edges of its groups of views and rows do, or
+    zero if that is too high for air.
+
+    It is air's if it is a small part of the greatest line integral; or if a flat field may be so
+    far off and the edges are as flat as air's: they grow inwards by less than a half of what an
+    ellipse of the greatest line integral does, whose squared line integrals are a parabola.
+
+    Args:
+        ends, nexts: the outermost columns and those beside them; NaN: not seen.
+        top: the greatest line integral.
+    """
+    flat = [x.permute(1, 2, 0, 3).flatten(2) for x in (ends, nexts)]
+    lowest = flat[0].nanquantile(AIR_QUANTILE, dim=2, keepdim=True).nan_to_num(0).clamp_min(0)
+    growth = (flat[1] - flat[0]).nanmedian(dim=2, keepdim=True).values
+    inwards = 2 * (1 + BESIDE) * OUTERMOST  # twice the way in units of a half row
+    ellipse = (lowest.square() + (top.square() - lowest.square()) * inwards).sqrt() - lowest
+    off = (lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top) & (growth < ellipse / 2)
+    return torch.where((lowest < CUT_EDGE * top) | off, lowest, 0)
+
+
+def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) -> None:
     """Warn of views that end inside the object, whose jump at the edge the ramp filter takes for
     a part of the object, or whose continuation is a guess.
 
     An edge shows an object if it is above what air reads there by more than a flat field may be
-    off and than the noise of a group of views. Air reads what the lowest edge of that side does,
-    of all views and rows, or zero if even that is too high for air. Sides that other views measure
-    better do not count.
+    off and than the noise of a group of views, see `_air`. Sides that other views measure better do
+    not count.
     """
     edges = edges.flatten(0, 1)
     count = min(VIEW_GROUPS, edges.shape[1])
@@ -175,12 +209,13 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 7 i"], extrapolate: bool) -> 
     def grouped(x: Float[Tensor, "k m n i"]) -> Float[Tensor, "g k n i"]:
         return torch.stack([part.mean(dim=1) for part in x.tensor_split(count, dim=1)])
 
-    ends, shares, level, greatest, noise = edges.split(PARTS, dim=-2)
-    seen = (shares > 0.5).to(ends)
-    ends, seen = divided(grouped(ends * seen), grouped(seen), -math.inf), grouped(seen) > 0
+    ends, nexts, shares, level, greatest, noise = edges.split(PARTS, dim=-2)
+    used = (shares > 0.5).to(ends)
+    seen = grouped(used)
+    ends, nexts = (divided(grouped(x * used), seen, -math.inf) for x in (ends, nexts))
     most, top = (grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
-    lowest = torch.where(seen, ends, math.inf).amin(dim=(0, 3)).clamp_min(0)[..., None]  # [k 2 1]
-    air = torch.where(lowest < CUT_EDGE * top, lowest, 0)
+    known, beside = (torch.where(seen > 0, x, torch.nan) for x in (ends, nexts))
+    air = _air(known, beside, top)
     noise = grouped(noise) / math.sqrt(edges.shape[1] // count)
     cut = (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)  # [g k i]
     views = cut.double().mean(dim=0)

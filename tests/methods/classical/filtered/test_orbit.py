@@ -1,14 +1,16 @@
 """The circle of the sources is worked out of the cameras; rigs that have none are refused."""
 
 import math
+import warnings
 from dataclasses import replace
 
 import pytest
 import torch
 
 from mvrecon.data.scenes.solids import Phantom, Solids
+from mvrecon.geometry.cameras.field import auto_grid, full_fan
 from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
 from mvrecon.methods.classical.fdk import fbp, fdk
 from mvrecon.methods.classical.orbit import orbit_of
@@ -137,6 +139,38 @@ def test_voxels_beside_the_common_slab_of_a_helix_are_named():
         x = fdk(Drr(tall, helix), views_of(cylinder(), helix))
     assert x[0, 0, 12, 12, 12] == pytest.approx(VALUE, rel=0.01)
     assert x[0, 0, -1, 12, 12] < 0.7 * VALUE
+
+
+SHORT_CONES = {
+    "whole turn": ({}, {}),
+    "raised": ({"offset_mm": [20.0, 0.0]}, {}),
+    "half fan": ({"offset_mm": [0.0, 100.0]}, {}),
+    "short scan": ({}, {"arc_degrees": 250.0}),
+}
+
+
+@pytest.mark.parametrize("kind", SHORT_CONES)
+def test_an_automatic_grid_warns_of_its_rows_where_the_object_extends_beyond_them(kind: str):
+    """A box as high as the field at the isocentre has voxels that rows of near sources do not
+    reach, but every object that all views see whole: a ball that touches the field keeps its value
+    to its top without a warning, a long cylinder is read low there, and this is said.
+    """
+    panel, arc = SHORT_CONES[kind]
+    plate = {"pixels": [24, 48], "pixel_mm": 10.0} | panel
+    rig = circular(90, 400.0, 800.0, plate, **arc)
+    grid = auto_grid(full_fan(rig))
+    reach = plate.get("offset_mm", [0.0])[0]
+    radius = 0.95 * 400 * math.sin(math.atan((120 - abs(reach)) / 800))
+    size, turn = torch.full((1, 3), radius), torch.eye(3)[None]
+    ball = Solids("ellipsoid", torch.zeros(1, 3), turn, size, torch.tensor([VALUE]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        x = fdk(Drr(grid, rig), views_of(Phantom((ball,)), rig))[0, 0]
+    centres = voxel_centres(grid)
+    top = (centres.norm(dim=-1) < 0.9 * radius) & (centres[..., 2].abs() > 0.6 * radius)
+    assert x[top].mean().item() == pytest.approx(VALUE, rel=0.04)
+    with pytest.warns(UserWarning, match="above or below the rows .* extends beyond these rows"):
+        x = fdk(Drr(grid, rig), views_of(cylinder(height=600.0), rig))[0, 0]
 
 
 @pytest.mark.parametrize("kind", ["fan", "parallel"])
