@@ -33,7 +33,7 @@ class Frames:
     """Frames [n v u] of one data set, or of those that a virtual one consists of.
 
     Args:
-        place: of the data set; one image is one frame.
+        place: place of the data set; one image is one frame.
         folder: other files must be in it, or below.
 
     Raises:
@@ -131,11 +131,11 @@ class FrameViews(ProjectionStack):
 
     Args:
         frames: all of them.
-        numbers: of these.
+        numbers: numbers of the frames that are views.
         fields: flat and dark fields.
-        rig: that the file states.
+        rig: the rig that the file states.
         folder: other files must be in it, or below.
-        exposures: of all frames, by their names; NaN where the file states none.
+        exposures: exposures of all frames, by their names; NaN where the file states none.
     """
 
     def __init__(
