@@ -33,7 +33,7 @@ install() { "$bin/python" -m pip --disable-pip-version-check --no-input install 
 
 # torch first and alone: it is by far the largest, and there are several builds of one version.
 torch=$(grep '^torch==' constraints.txt)
-default="$torch, the build of pip's package index; on Linux it has CUDA: 2.7 GB to download, 4.6 GB on the disk"
+default="$torch, the build of pip's package index; on Linux it has CUDA: several GB to download"
 if [[ $(nvidia-smi -L 2>/dev/null) == *GPU* ]]; then
     echo "There is an NVIDIA GPU: $default."
     install "$torch"

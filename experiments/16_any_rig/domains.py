@@ -38,8 +38,8 @@ def psnr(volume: Tensor, truth: Tensor) -> float:
 def main() -> None:
     """Reconstruct cases of each scene with each rig by all methods."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", help="with the files of scripts/data/prepare_openkbp.py")
-    parser.add_argument("--network", default="any_rig", help="as of mvrecon.load")
+    parser.add_argument("folder", help="folder with the files of scripts/data/prepare_openkbp.py")
+    parser.add_argument("--network", default="any_rig", help="weights, as mvrecon.load takes them")
     parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
     given = parser.parse_args()
     trained, grid, rows = mv.load(given.network), mv.Grid.centred(**GRID), []

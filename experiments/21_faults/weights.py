@@ -42,7 +42,7 @@ MEASUREMENT = {
 def main() -> None:
     """Reconstruct every test case of `experiment=open_kbp_faults` with several weights."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", help="with the files of scripts/data/prepare_openkbp.py")
+    parser.add_argument("folder", help="folder with the files of scripts/data/prepare_openkbp.py")
     parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
     given = parser.parse_args()
     scenes = {

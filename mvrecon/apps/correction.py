@@ -54,8 +54,8 @@ class Corrections:
         free: errors of the rig that are fitted to the views, see `unknowns`.
         grid: f(cameras) -> the grid that is reconstructed with a fitted rig.
         align: aligns the views; None: they stay.
-        self_calibrate: by `align`, correct the gains of the views, and the positions of the cameras
-            instead of shifting their views.
+        self_calibrate: with `align`, correct the gains of the views, and the positions of the
+            cameras instead of shifting their views.
 
     Raises:
         ValueError: `self_calibrate` without `align`.

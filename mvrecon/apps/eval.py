@@ -27,7 +27,7 @@ def evaluate(options: EvalSettings, folder: Path) -> Results:
         options: `checkpoint` (a run folder, or a checkpoint in one), and what differs from the
             run: `test_scene`, `acquisition`, `camera`, `grid`, `data`, further `compare`; `device`
             and `save`.
-        folder: where the results go, with `eval.yaml`, which is `options`, and `versions.txt`.
+        folder: folder of the results, with `eval.yaml`, which is `options`, and `versions.txt`.
 
     Raises:
         FileNotFoundError: no checkpoint or no run is there.

@@ -40,10 +40,10 @@ class Output:
     """Files of a reconstruction.
 
     Args:
-        name: of the run.
-        folder: of the run.
+        name: name of the run.
+        folder: folder of the run.
         volume: file of the volume.
-        unit: of the volume.
+        unit: unit of the volume.
         like: the file whose order of axes the volume gets, if any.
     """
 

@@ -102,7 +102,7 @@ def read_scan(
     """Open the scan of settings; raises as `open_scan`.
 
     Args:
-        settings: of a reconstruction.
+        settings: settings of a reconstruction.
         choose_grid: f(cameras) -> the grid; None: by the settings alone, without a trained network.
     """
     from mvrecon.apps.scan import GridOfScan, open_scan
@@ -141,14 +141,14 @@ def reconstruct(
     volume's unit. Ctrl-C ends an iterative method with its last iterate, number `stopped`.
 
     Args:
-        scan: as measured.
-        method: that reconstructs it.
+        scan: the views as measured.
+        method: the method that reconstructs them.
         output: files.
-        corrections: before the reconstruction.
-        settings: of the run; `left_out`: also predict each view from all others, by one more
-            reconstruction each.
-        device: to compute on.
-        bar: of the run.
+        corrections: those made before the reconstruction.
+        settings: settings of the run; `left_out`: also predict each view from all others, by one
+            more reconstruction each.
+        device: device to compute on.
+        bar: the run's progress bar.
 
     Raises:
         OSError: the volume cannot be written, as on a disk without space for it; a computed one is

@@ -138,11 +138,12 @@ class Rig(NamedTuple):
     """A hypothesis about the rig.
 
     Args:
-        cameras: of the coarse views.
-        squares: of each view's residual after `SEARCH_ITERATIONS`, relative to those of all views.
-        words: that state how the views fit it better; empty for the stored one.
+        cameras: cameras of the coarse views.
+        squares: squared norm of each view's residual after `SEARCH_ITERATIONS`, relative to that of
+            all views.
+        words: how the views fit this rig better, in words; empty for the stored one.
         cure: what the user is asked.
-        order: of the views' axes, of `ORDERS` or `STORED_ORDER`.
+        order: order of the views' axes, one of `ORDERS` or `STORED_ORDER`.
     """
 
     cameras: Cameras
@@ -161,8 +162,8 @@ class SomeViews(NamedTuple):
     """Some views of a scan, binned to the size of a coarse voxel's image.
 
     Args:
-        scan: of line integrals, that they are of.
-        numbers: of the views.
+        scan: the scan, of line integrals.
+        numbers: numbers of the views.
         first: the first view as it is stored.
         region: the pixels that are joined to one.
         cameras: stored ones of the coarse views.

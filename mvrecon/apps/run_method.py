@@ -34,8 +34,8 @@ class Outcome:
     """A reconstruction.
 
     Args:
-        volume: in the unit of the views per mm.
-        seconds: of the method, without the compilation of kernels.
+        volume: reconstructed volume, in the unit of the views per mm.
+        seconds: run time of the method in s, without the compilation of kernels.
         peak_bytes: most memory of the process so far; None if the system does not report it.
         residuals: |y - A x| after each iteration, in the unit of the views; empty for a method
             that does not iterate.
@@ -71,7 +71,7 @@ class Choose(TypedDict, total=False):
 
     Args:
         every: one view in so many is left out.
-        weights: of the method, to choose from.
+        weights: values of the method's option `weight` to choose from.
         patience: iterations without improvement that end a trial.
     """
 
@@ -118,7 +118,7 @@ class Method:
 
         Args:
             method: name and options.
-            stop_sigma, choose: as of the class.
+            stop_sigma, choose: as in the class.
 
         Raises:
             LookupError, TypeError: no such method, or no such option of it.

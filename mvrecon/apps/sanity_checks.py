@@ -65,10 +65,10 @@ def sanity_checks(
     its volume alone; a method declares its data, `declares`.
 
     Args:
-        scan: that was reconstructed.
+        scan: the scan that was reconstructed.
         method: name of the method.
         outcome: its volume, in the unit of the views per mm.
-        device: for the comparison.
+        device: device that computes the comparison.
         as_read: the views before a correction, which leaves no whole counts; None: the scan's.
     """
     words: list[str] = []

@@ -89,11 +89,11 @@ class Scan:
         cameras: one for each view.
         grid: the voxels to reconstruct.
         projector: name and options of the operator.
-        unit: of the volume.
+        unit: unit of the volume.
         counts: whether the views are counts of emission.
         scatter: expected in these counts, in the views' unit; None: none.
         dose: counts per unit of the views, which were divided by it.
-        factors: of the pixels, such as of a detector's uniformity; None: one.
+        factors: factor of each pixel, such as its uniformity; None: one.
         rig: the cameras of all views on disk, before choice, crop and binning; None: unknown.
         parts: scans whose views these are, one after the other, each with its projector, see
             `joined`; empty: these are views by `projector`.
@@ -312,8 +312,8 @@ def _read(
     """The counts of a file of further views of the same detectors, in the duration of the views.
 
     Args:
-        views: of the scan.
-        path: of the file.
+        views: views of the scan.
+        path: path of the file.
         relative: any values, also of an unknown dose, as they are.
         widths_kev: they are those of an energy window of this width, of the scan's of the second
             width; None: unknown.
@@ -415,8 +415,8 @@ def check_unit(unit: str, scan: Scan, view: int) -> None:
     """Check that the views have the projector's unit: line integrals or not.
 
     Args:
-        unit: of the views' file: "... * mm" of line integrals, "<projector> of ..." of others.
-        scan: that they are of.
+        unit: unit in the views' file: "... * mm" of line integrals, "<projector> of ..." of others.
+        scan: the scan with these views.
         view: one that sees the grid.
 
     Raises:

@@ -73,9 +73,9 @@ class Further(TypedDict, total=False):
 
     Args:
         views: options of its views, such as another path or dataset.
-        camera: of its rig.
+        camera: options of its rig.
         projector: such as mu and intrinsic_mm at its energy.
-        scatter: in its counts.
+        scatter: scatter in its counts.
         factors: such as branching at its energy, or time_s of a frame.
     """
 

@@ -40,9 +40,9 @@ def train(
     `checkpoints/`, `review/` and `results.json`.
 
     Args:
-        settings: of the run.
-        folder: of the run.
-        overrides: of the command line, for TensorBoard.
+        settings: settings of the run.
+        folder: folder of the run.
+        overrides: options on the command line, for TensorBoard.
         steps: trainer.max_steps from now on, more than in the settings of the folder's run; None:
             as there.
 
@@ -91,7 +91,7 @@ def resumed(folder: Path, others: Sequence[str]) -> tuple[TrainSettings, Path]:
     """Settings and folder of a run to resume.
 
     Args:
-        folder: of the run, or a checkpoint in it.
+        folder: folder of the run, or a checkpoint in it.
         others: further options of the command line.
 
     Raises:

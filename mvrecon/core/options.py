@@ -112,9 +112,9 @@ def _mapped(
     nothing to check, nor to import.
 
     Args:
-        value: to copy.
+        value: data to be copied.
         type: its type.
-        path: where it is.
+        path: place of the value in the settings.
         change: f(value, type).
         at: f(section), called with each mapping of options first; true: it stays as it is.
     """
@@ -283,7 +283,7 @@ def with_paths(value: Any, type: Any, change: Callable[[str, bool], str | Path])
     pattern with which `Path` is annotated.
 
     Args:
-        value: to copy.
+        value: data to be copied.
         type: its type.
         change: f(path, whether it may be a name of weights).
     """

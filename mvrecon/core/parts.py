@@ -17,9 +17,9 @@ class PartOf:
     """Marks the type of a mapping of a part's name and options.
 
     Args:
-        kind: of the part.
+        kind: kind of the part.
         also: "module:name" of further options, which are not the part's own.
-        classical: of methods: a function, without weights.
+        classical: whether only classical methods are allowed: functions, without weights.
         partial: options without a name change those of a part that the app knows.
         targets: "module:name" of f(target) -> the class of a `_target_`, which may take the place
             of a name.
@@ -43,7 +43,7 @@ class NamesOf:
     """Marks the type of a mapping whose keys are names of parts, and whose values are numbers.
 
     Args:
-        kind: of the parts.
+        kind: kind of the parts.
     """
 
     kind: str

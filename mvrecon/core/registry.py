@@ -79,7 +79,7 @@ class Registry:
     """Parts of one kind by name.
 
     Args:
-        kind: of the parts, in the singular ("projector"), as in plugins' entry-point names.
+        kind: kind of the parts in the singular ("projector"), as in plugins' entry-point names.
         passed: number of leading arguments that mvrecon passes, which are no options.
         builtin: mvrecon's own parts, name -> "module:attribute".
     """
@@ -213,10 +213,10 @@ def check_options(owner: str, options: Iterable[Any], known: Iterable[str], path
     """Check the names of options.
 
     Args:
-        owner: of the options, for the message.
+        owner: what has the options, for the message.
         options: names.
         known: names of all options.
-        path: of the owner in settings, where an experiment may set an option of another part.
+        path: place of the owner in settings, where an experiment may set an option of another part.
 
     Raises:
         TypeError: an unknown option; the message gives the nearest, and all.

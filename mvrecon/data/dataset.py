@@ -129,10 +129,10 @@ class Case(TypedDict, extra_items=Tensor):
     rig the errors: "shift_px" [m 2], "gain" [m], "wrong" [m] and others.
 
     Attributes:
-        views: as measured.
+        views: the views as measured.
         volume: the truth.
         inside: the voxels of the object.
-        name: of the case.
+        name: name of the case.
         rig: number of its rig, see `ManyRigs`.
     """
 
@@ -158,9 +158,9 @@ class SceneDataset(Dataset[Case]):
 
     Args:
         scene: the source of the cases.
-        grid: of the true volume.
+        grid: grid of the true volume.
         cameras: the rig.
-        indices: of the cases.
+        indices: indices of the cases.
         seed: the series of cases.
         cache: keep cases in memory once computed; `prepare` computes them all.
         fresh: increment of a case's index from epoch to epoch; 0: the same cases in every epoch.
@@ -274,13 +274,13 @@ class EpochOrder(Sampler[int]):
     equal shares.
 
     Args:
-        count: of items.
-        seed: of the orders.
+        count: number of items.
+        seed: seed of the orders.
         rank: number of this process.
         world: number of processes.
         rigs: number of rigs, in order and with equally many items each, and number of consecutive
             items of one rig, those of a batch of all processes; None: one rig.
-        fresh: each epoch has its own items, from `epoch * count` on.
+        fresh: whether each epoch has its own items, from `epoch * count` on.
 
     Attributes:
         generator: seeds the loader's worker processes, also by (seed, epoch) only.
@@ -372,9 +372,9 @@ class ManyRigs(Dataset[Case]):
 
     Args:
         scene: the source of the cases.
-        grid: of the true volume.
+        grid: grid of the true volume.
         rigs: the rigs.
-        indices: of the cases, dealt to the rigs in turn; the remainder is dropped.
+        indices: indices of the cases, dealt to the rigs in turn; the remainder is dropped.
         seed: the series of cases.
         together: consecutive cases of one rig, those of a batch of all processes; divides their
             number.

@@ -102,7 +102,7 @@ def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid
     while it is read.
 
     Args:
-        folder: with the files of the series, or a file with all of its slices as frames.
+        folder: a folder with the files of the series, or a file with all of its slices as frames.
         resample: shift the slices of a tilted gantry within their planes, by linear interpolation,
             until they are aligned; `AIR` outside a slice.
 

@@ -123,13 +123,13 @@ class DicomImage:
     """The attributes of a DICOM image of one grey value per pixel, for each frame.
 
     Attributes:
-        dataset: of pydicom.
+        dataset: the data set as pydicom reads it.
         frames: number of frames, by default 1.
         groups: number of functional groups of single frames: that of the frames, or 0.
         shape: rows and columns.
 
     Args:
-        path: of the file.
+        path: path of the file.
         pixels: whether to read its pixels as well.
 
     Raises:
@@ -172,7 +172,8 @@ class DicomImage:
 
         Args:
             name: such as RescaleSlope.
-            frame: of this frame alone: the image's, the shared and its own; None: of all.
+            frame: number of a frame, for the values of this frame alone: the image's, the shared
+                and its own; None: those of all.
         """
         own = self._frames if frame is None else self._frames[frame : frame + 1]
         found = []
@@ -300,7 +301,7 @@ def _holders(
     """The data sets with each attribute: a functional group, and those nested in its sequences.
 
     Args:
-        group: of pydicom.
+        group: a data set of pydicom.
         held: is extended.
         inside: whether to enter a sequence; by default, if it does not describe other images.
     """

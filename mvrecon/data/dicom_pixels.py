@@ -115,7 +115,7 @@ def pixels_of(path: Path, air: float | None = None) -> Float[np.ndarray, "*m v u
     Ignores MONOCHROME1 and windows, which affect display only.
 
     Args:
-        path: of the image.
+        path: path of the image.
         air: greatest value of padding pixels; None: padding is refused, but of NM where it has zero
             counts.
 

@@ -130,7 +130,7 @@ class Stored:
     """One volume of a file.
 
     Args:
-        name: of the volume.
+        name: name of the volume.
         ct: values [d h w] in the file's `units`, such as HU.
         spacing: mm along (z, y, x).
         label: structures [d h w], or None.
@@ -219,7 +219,7 @@ class VolumeFile:
     """A volume file for reading, opened at first use in every process; pickled by its path.
 
     Args:
-        path: of the file.
+        path: path of the file.
     """
 
     def __init__(self, path: str | Path):

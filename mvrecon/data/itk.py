@@ -57,7 +57,7 @@ def itk_image(path: Path, least: int = 3) -> ItkImage:
     """Read the header of an image of three axes, checked against the file's size.
 
     Args:
-        path: of the file.
+        path: path of the file.
         least: number of axes; 2 accepts an image of one plane.
 
     Raises:

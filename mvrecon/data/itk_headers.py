@@ -358,7 +358,7 @@ def nrrd_header(path: Path, text: str) -> Header:
     kinds, sizes = (entries.get(name, "").lower().split() for name in ("kinds", "sizes"))
     if any(kind == "time" and size != "1" for kind, size in zip(kinds, sizes, strict=False)):
         raise checks.Refused(f"{path}: expected kinds of lengths, got {entries['kinds']}")
-    lines, skip = (int(entries.get(name, 0)) for name in ("lineskip", "byteskip"))
+    lines, skip = (_whole(path, entries, name, 0) for name in ("line skip", "byte skip"))
     raw, encoding = text.encode("latin-1"), entries.get("encoding", "raw").lower()
     if lines < 0 or skip < (-1 if encoding == "raw" else 0):
         raise checks.Refused(
@@ -366,7 +366,9 @@ def nrrd_header(path: Path, text: str) -> Header:
             f"{lines} and {skip}"
         )
     for _ in range(lines):
-        first = raw.index(b"\n", first) + 1
+        first = raw.find(b"\n", first) + 1
+        if first == 0:
+            raise checks.Refused(f"{path}: expected {lines} lines to skip, got fewer")
     units = [entries.get(name, "") for name in ("units", "spaceunits")]
     quoted = [unit for text in units for unit in re.findall(r'"([^"]*)"', text)]
     mm = _millimetres(path, quoted or [""], "units and space units")
@@ -402,10 +404,19 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
     return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
 
 
+def _whole(path: Path, entries: Mapping[str, str], key: str, default: int) -> int:
+    """The whole number of an NRRD's field, as both C and Python read it."""
+    text = entries.get(key.replace(" ", ""), str(default))
+    if not re.fullmatch("[+-]?[0-9]{1,15}", text):
+        raise checks.Refused(f"{path}: expected a whole number as {key}, got {checks.shown(text)}")
+    return int(text)
+
+
 def _check_places(path: Path, entries: Mapping[str, str]) -> None:
     """Check the numbers of an NRRD's places: ITK ignores those that are not finite."""
     directions, spacings = entries.get("spacedirections"), entries.get("spacings", "")
-    axes, count = (int(entries.get(name, 3)) for name in ("spacedimension", "dimension"))
+    axes = int(entries.get("spacedimension", 3))  # one of those in NRRD_KEYS
+    count = _whole(path, entries, "dimension", 3)
     for name, text, vectors in (
         ("space directions", directions, axes),
         ("space origin", entries.get("spaceorigin"), 1),

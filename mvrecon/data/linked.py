@@ -57,11 +57,11 @@ def followed(
     at its path, relative to this file's folder, or else by its name beside this file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         name: such as "/entry/data/data".
-        expected: for messages.
+        expected: what should be there, for messages.
         folder: other files must be in it, or below; None: that of `path`.
-        links: that were followed before.
+        links: the links that were followed before.
 
     Raises:
         MissingFile: another file that is not in the folder.
@@ -137,8 +137,8 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
     """The numbers of a small data set.
 
     Args:
-        place: of the data set.
-        expected: for messages.
+        place: place of the data set.
+        expected: what should be there, for messages.
         known: its attributes that the caller applies.
 
     Raises:
@@ -222,9 +222,9 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
     `order` or `<axis>_indices`; unknown names may be anywhere.
 
     Args:
-        place: of the data set or group.
+        place: place of the data set or group.
         axes: patterns of the names of each axis.
-        expected: for messages.
+        expected: what should be there, for messages.
 
     Raises:
         Refused: a name of an axis at another's place.

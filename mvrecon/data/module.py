@@ -112,8 +112,8 @@ class SceneData(L.LightningDataModule):
         sizes: the number of cases for "train", "val" and "test"; a file may hold fewer.
         overlap: training, validation and test use the same first cases of a file, as for a file
             with one volume.
-        seed: of the training cases and their order.
-        loading: of `Loading`.
+        seed: seed of the training cases and their order.
+        loading: options of `Loading`.
 
     Raises:
         TypeError: an unknown option of the acquisition or of loading; a data range that is not a

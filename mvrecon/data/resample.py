@@ -30,7 +30,7 @@ class Slabs:
 
     Args:
         shape: voxels along (z, y, x).
-        axis: of the tensor, 0 to 2, along which the slabs are cut, in any order.
+        axis: axis of the tensor, 0 to 2, along which the slabs are cut, in any order.
         passes: begins a pass, which yields the first index along the axis and the values of every
             slab.
         stored: affine from a voxel's index (i, j, k) in the file to world mm; None: no file.
@@ -110,9 +110,9 @@ def oriented(
     values do not move.
 
     Args:
-        path: of the file, for messages.
+        path: path of the file, for messages.
         shape: voxels along the file's axes i, j, k.
-        affine: from a voxel's index (i, j, k) to world mm (RAS).
+        affine: map from a voxel's index (i, j, k) to world mm (RAS).
         passes: begins a pass over the file, which yields its planes along k.
 
     Raises:
@@ -157,9 +157,9 @@ def storable(
     world mm (RAS).
 
     Args:
-        path: of the file, for messages.
+        path: path of the file, for messages.
         volume: the values.
-        grid: of the volume.
+        grid: grid of the volume.
         stored: an affine that has the grid's axes in another order, permuted and reversed: that of
             the result; None: the grid's.
 

@@ -26,7 +26,7 @@ def texts_of(path: Path, *places: str) -> dict[str, list[str]]:
     """Return texts of a file by their places.
 
     Args:
-        path: of the file.
+        path: path of the file.
         places: "<data set>@<attribute>", or "<data set>@" for the text that it is. None: the
             attributes of the file that are one text each, "@<name>", and its dataset `id` of texts.
 

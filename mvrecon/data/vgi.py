@@ -126,7 +126,7 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
     and z are those of the file, x the fastest.
 
     Args:
-        path: of the .vgi.
+        path: path of the .vgi.
 
     Raises:
         FileNotFoundError: nothing is there.

@@ -55,7 +55,7 @@ def open_volume(path: str | Path, resample: bool = False) -> tuple[Slabs, Grid]:
     Args:
         path: NIfTI, MHA, MHD or NRRD by its ending, or that of a plugin, such as .dcm; a folder
             with one DICOM CT series, or a DICOM file with all of its slices.
-        resample: for a tilted gantry, see `data.dicom.open_series`.
+        resample: interpolate the slices of a tilted gantry, see `data.dicom.open_series`.
 
     Raises:
         ImportError: a library of the extra `io` is not installed.
@@ -89,11 +89,11 @@ def save_volume(
     atomically.
 
     Args:
-        path: of the file; its ending is .nii, .nii.gz, .mha, .nrrd or that of a plugin, such as
-            .dcm.
+        path: path of the file; its ending is .nii, .nii.gz, .mha, .nrrd or that of a plugin, such
+            as .dcm.
         volume: the values.
-        grid: of the volume.
-        unit: of the values, such as "activity", which DICOM requires.
+        grid: grid of the volume.
+        unit: unit of the values, such as "activity", which DICOM requires.
         like: a volume file with the voxels of the grid, whose order of axes the written file gets,
             so that other programs read arrays that can be compared; None: the grid's. The files of
             plugins have an order of their own.

@@ -89,7 +89,7 @@ class FileScene(Scene):
     """CT volumes as cases, in their true size.
 
     Args:
-        path: of the file.
+        path: path of the file.
         crop: "body" moves the centre of the patient's box to the grid's centre, "none" keeps the
             file's position (about the origin if the file has none).
         fine: refinement of the grid that views are projected from relative to the true volume's; at
@@ -101,9 +101,9 @@ class FileScene(Scene):
         vary: continue beyond the last case with varied copies, new in every pass: True mirrors left
             to right, rotates, scales and shifts at random; "exact" only mirrors and shifts, without
             interpolation, the same for every seed.
-        data_range: for PSNR and SSIM, in 1/mm. 0.04 is twice water, the usual window of -1000 to
-            1000 HU. Of activity, in its unit.
-        stored_unit: of the numbers in the file: HU (converted by `data.attenuation`), 1/mm, or
+        data_range: range of values for PSNR and SSIM, in 1/mm; of activity in its unit. 0.04 is
+            twice water, the usual window of -1000 to 1000 HU.
+        stored_unit: unit of the numbers in the file: HU (converted by `data.attenuation`), 1/mm, or
             activity, which are projected unchanged.
 
     Raises:

@@ -95,8 +95,8 @@ class Lattice:
 
     Args:
         shape: samples along the tensor's axes (k, j, i).
-        matrix: from space, in voxels of one grid about its centre, to lifted indices; denominators
-            are positive on the valid side of the source.
+        matrix: map from space, in voxels of one grid about its centre, to lifted indices;
+            denominators are positive on the valid side of the source.
         lift: (a, b) of s = a + b k.
     """
 

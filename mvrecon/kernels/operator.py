@@ -49,11 +49,12 @@ def define(schema: str, modules: Mapping[str, str], shape: Rule, prefix: str = "
     """Define an operator `torch.ops.mvrecon.<prefix><name>`.
 
     Args:
-        schema: as in PyTorch's `native_functions.yaml`, "name(Tensor x, ..) -> Tensor".
-        modules: by device type, the module with the function of this name and arguments; imported
-            at the first call, as numba is heavy.
+        schema: name and arguments as in PyTorch's `native_functions.yaml`, "name(Tensor x, ..) ->
+            Tensor".
+        modules: for each device type, the module with the function of this name and arguments;
+            imported at the first call, as numba is heavy.
         shape: maps the arguments to an empty tensor like the result.
-        prefix: of the operator's name, but not of the functions'.
+        prefix: what the operator's name begins with, but not the functions'.
     """
     name = schema.partition("(")[0]
     whole = f"mvrecon::{prefix}{name}"
@@ -209,10 +210,11 @@ def differentiable(
     """Add derivatives for torch, `torch.func` and `torch.compile` to an operator or function.
 
     Args:
-        operator: of (values, geometry, ..) if linear, else of (values, cotangent, geometry, ..).
+        operator: function of (values, geometry, ..) if linear, else of (values, cotangent,
+            geometry, ..).
         apply: the same in plain torch, the source of derivatives that are not given.
-        backward: of (ctx, cotangent), see `saved_inputs`; implies that the operator is linear in
-            the first input.
+        backward: function of (ctx, cotangent), see `saved_inputs`; implies that the operator is
+            linear in the first input.
         shared: number of arguments behind the geometry that other values share.
     """
     linear, count = backward is not None, 3 if backward is None else 2
@@ -374,11 +376,11 @@ def choose_backend(
     """Choose the back end of a tensor: "cpu", "cuda" or "reference".
 
     Args:
-        tensor: of the call: volumes or views [b c ..].
+        tensor: argument of the call: volumes or views [b c ..].
         backend: "auto" selects the compiled one of the tensor's device if available, else the
             reference.
-        purpose, tests: of the kernels, and their self-test on a GPU, see `self_test.failure`;
-            without it a GPU has only the reference.
+        purpose, tests: purpose of the kernels, and their self-test on a GPU, see
+            `self_test.failure`; without it a GPU has only the reference.
 
     Raises:
         ValueError: an unknown back end, or a compiled one of another device.

@@ -34,8 +34,8 @@ def failure(
 
     Args:
         device: a CUDA device.
-        purpose: of the kernels: a method of rays, "warp" ...
-        dtype: of the volumes or views.
+        purpose: what the kernels compute: a method of rays, "warp" ...
+        dtype: type of the volumes or views.
         tests: the self-tests.
     """
     place = torch.device(device)

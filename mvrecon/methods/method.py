@@ -26,8 +26,8 @@ class CameraPrior(NamedTuple):
     """Standard deviations of a camera's expected errors.
 
     Args:
-        shift_px: along each axis, in pixels.
-        gain: relative.
+        shift_px: standard deviation of the shift along each axis, in pixels.
+        gain: standard deviation of the relative gain.
     """
 
     shift_px: float = 1.0
@@ -43,7 +43,8 @@ class Alignment:
     """Estimated errors of each view, with standard errors.
 
     Args:
-        shift_px: of the detector along its columns' and its rows' direction (u, v), in pixels.
+        shift_px: shift of the detector along its columns' and its rows' direction (u, v), in
+            pixels.
         gain: factor of the view's values; 0: the view is lost.
         shift_error: standard error of the shifts, in pixels.
         gain_error: standard error of the gains.
@@ -93,10 +94,10 @@ class Reconstruction:
     Per-view quantities have the resolution of the method's frusta, in cells of voxels or pixels.
 
     Args:
-        volume: in the unit of (views / mm).
+        volume: reconstructed volume, in the unit of (views / mm).
         per_view: each camera's own estimate of the volume.
         visible: voxels inside each camera's frustum.
-        weights: of each camera at each voxel; they sum to one over the cameras that see it.
+        weights: weight of each camera at each voxel; they sum to one over the cameras that see it.
         ray_weights: factor of each ray's residual; one counts fully.
         predictions: leave-one-out prediction of each view from the other cameras' estimates, in the
             unit of the views.
@@ -155,7 +156,7 @@ class Solver(nn.Module):
 
     Args:
         solve: f(A, views, **options), which returns a volume.
-        options: of the function.
+        options: options of the function.
     """
 
     def __init__(self, solve: Callable[..., Tensor], options: Mapping[str, Any]):
@@ -199,9 +200,9 @@ def reconstruct(
     Args:
         views: line integrals.
         cameras: the rig that measured them.
-        grid: of the volume.
+        grid: grid of the volume.
         method: its name; `mvrecon-list method` lists all, with their options.
-        options: of the method.
+        options: options of the method.
 
     Returns:
         The volume on the grid.
@@ -243,7 +244,7 @@ def finer(
 
     Args:
         A: the operator, with the capability "refine".
-        views: in the operator's unit.
+        views: the views, in the operator's unit.
         fine: voxels per voxel of the grid, and rays per pixel, along each axis.
         method: name and options of the method; None: 25 iterations of SIRT with momentum.
         support: the voxels of the grid that may differ from zero.

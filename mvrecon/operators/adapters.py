@@ -60,7 +60,7 @@ def from_xyz(
 
     Args:
         values: MONAI's `MetaTensor` as it is, TorchIO's `image.data`.
-        affine: from voxel (x, y, z) to RAS in mm, `image.affine`.
+        affine: map from voxel (x, y, z) to RAS in mm, `image.affine`.
 
     Raises:
         ValueError: no channel and three axes.
@@ -163,7 +163,7 @@ def scipy_operator(A: LinearOperator, dtype: Any = np.float64) -> Any:
 
     Args:
         A: the operator, on any device.
-        dtype: of its products, float32 or float64.
+        dtype: type of its products, float32 or float64.
 
     Raises:
         ImportError: SciPy is not installed.

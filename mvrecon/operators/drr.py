@@ -6,14 +6,13 @@ from mvrecon.operators.ray_transform import RayTransform
 
 class Drr(RayTransform):
     """Digitally reconstructed radiographs: integrals along the rays through each camera's point;
-    see `RayTransform`.
+    see `RayTransform`, also for the other arguments.
 
     Order of accuracy in the voxel size: "joseph" and "trilinear" two for smooth volumes, "siddon"
     one.
 
     Args:
         cameras: a rig of central cameras, or explicit rays.
-        grid, method, backend, rays_per_pixel, skip, support: as in `RayTransform`.
 
     Raises:
         ValueError: a parallel rig, or as `RayTransform`.

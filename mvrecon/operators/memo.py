@@ -55,7 +55,8 @@ def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
     Args:
         of: an operator, rig, grid or tensor. The value must not refer to it, else neither would be
             freed.
-        key: of the value among those of the object, with all else that determines it.
+        key: what distinguishes the value among those of the object, with all else that determines
+            it.
         make: computes the value.
     """
     if torch.compiler.is_compiling():

@@ -106,7 +106,7 @@ class PixelIntegral:
     mm times the weight's unit.
 
     Args:
-        weight: of each pixel, broadcasts to [m v u]; one: the integral itself.
+        weight: weight of each pixel, broadcasts to [m v u]; one: the integral itself.
         rays: lines each way over a pixel, evenly spaced; 1: the line through its centre.
     """
 
@@ -433,7 +433,7 @@ class Cropped(Wrapped):
     operator.
 
     Args:
-        A: of the whole grid.
+        A: the operator on the whole grid.
         box: the voxels of the crop.
         views: indices of the cameras; None: all.
     """
@@ -467,7 +467,7 @@ class PerSample(Wrapped):
     A single volume or view is passed to all of them.
 
     Args:
-        operators: of the samples.
+        operators: the operator of each sample.
     """
 
     per_sample = True

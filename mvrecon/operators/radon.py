@@ -5,7 +5,7 @@ from mvrecon.operators.ray_transform import RayTransform
 
 
 class Radon(RayTransform):
-    """Integrals along parallel rays; see `RayTransform`.
+    """Integrals along parallel rays; see `RayTransform`, also for the other arguments.
 
     A grid of one slice under detectors of one row is the 2-D Radon transform. Detector rows along z
     see a stack of slices: the volume is then read by whole rows along z, several times faster than
@@ -14,7 +14,6 @@ class Radon(RayTransform):
 
     Args:
         cameras: a rig of parallel beams.
-        grid, method, backend, rays_per_pixel, skip, support: as in `RayTransform`.
 
     Raises:
         ValueError: central cameras, explicit rays, or as `RayTransform`.

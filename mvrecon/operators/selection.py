@@ -23,7 +23,7 @@ class ViewSelection(LinearOperator):
     """Selects views, [b c m v u] -> [b c k v u], in the given order.
 
     Args:
-        shape: of all views, (m, v, u).
+        shape: shape of all views, (m, v, u).
         views: their indices, without repetition.
 
     Raises:
@@ -64,7 +64,7 @@ class RaySelection(LinearOperator):
     """Selects pixels of views, [b c m v u] -> [b c r], in the order of `chosen.nonzero()`.
 
     Args:
-        shape: of all views, (m, v, u).
+        shape: shape of all views, (m, v, u).
         chosen: the pixels.
 
     Raises:

@@ -25,7 +25,7 @@ class Stacked(Projector):
     Subsets of views hold every operator's, so that ordered subsets have all photopeaks.
 
     Args:
-        operators: of one grid and one device, with detectors of the same pixels.
+        operators: operators on one grid and one device, with detectors of the same pixels.
 
     Raises:
         ValueError: no operator, or operators of different volumes, pixels or devices.

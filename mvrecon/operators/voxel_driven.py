@@ -62,9 +62,9 @@ class Images(NamedTuple):
     """The images of every voxel of a grid in the views of a rig.
 
     Args:
-        maps: of `image_maps`, on the views' device.
+        maps: maps as `image_maps` returns them, on the views' device.
         ray_extent: valid range of a ray, of the rig.
-        shape: of the grid, (z, y, x).
+        shape: shape of the grid, (z, y, x).
     """
 
     maps: Float[Tensor, "m 4 2 3"]

@@ -43,13 +43,13 @@ class Row:
         scenes: names of the test scenes, a patient each.
         truths: mean and root mean square of each true volume; empty in tables of earlier versions.
         measured: settings of the test scenes and the grid.
-        figures: of merit by name, a value for each scene; nan for a failed volume.
+        figures: figures of merit by name, a value for each scene; nan for a failed volume.
         failed: number of scenes whose volume holds NaN or infinity.
         ms: milliseconds of one reconstruction.
-        train_seconds: of training.
+        train_seconds: duration of training, in s.
         parameters: number of weights.
         peak_mb: memory of a reconstruction, in units of 2^20 bytes; nan: unknown.
-        folder: of the run.
+        folder: folder of the run.
     """
 
     run: str

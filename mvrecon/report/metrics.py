@@ -36,9 +36,9 @@ class Metric:
     """Decorator that declares how tables show a figure of merit, an entry of `METRICS`.
 
     Args:
-        unit: of the figure, "1" for none; "": not declared.
+        unit: unit of the figure, "1" for none; "": not declared.
         column: heading of its column, without the unit; "": its name.
-        format: of its numbers.
+        format: format of its numbers.
         higher_is_better: whether a better volume has a higher figure.
         of_views: whether it is f(views, measured) of the volume's views [1 m v u] and the measured
             ones, instead of f(volume, truth, inside, data_range).
@@ -256,9 +256,9 @@ def case_metrics(
 
     Args:
         volume: reconstructed.
-        views: of that volume.
+        views: projections of that volume.
         case: a batch of one, with the true "volume", "inside" and the measured "views".
-        data_range: for PSNR and SSIM.
+        data_range: range of the true values, for PSNR and SSIM.
 
     Raises:
         TypeError, ValueError: as `volume_metrics`.

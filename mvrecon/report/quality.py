@@ -44,9 +44,10 @@ def coverage(error: Float[Tensor, "*n"], sigma: Float[Tensor, "*n"], share: floa
     at edges, for which a Gaussian's is too wide at 0.68 and too narrow at 0.95.
 
     Args:
-        error: of each value.
+        error: error of each value.
         sigma: its standard deviation, in the same unit.
-        share: between 0 and 1; 0.68 means |error| <= 0.806 sigma, 0.95 means 2.118 sigma.
+        share: nominal share of errors, between 0 and 1; 0.68 means |error| <= 0.806 sigma, 0.95
+            means 2.118 sigma.
     """
     wide = -math.log(1 - share) / math.sqrt(2)
     return (error.abs() <= wide * sigma).double().mean().item()

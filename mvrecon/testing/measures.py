@@ -163,8 +163,8 @@ def gradient_gap(
     Args:
         f: a function of float64 tensors, reduced to a number by random weights.
         inputs: its arguments; those that require a gradient are tested one by one.
-        directions: per input.
-        step: of the differences.
+        directions: number of directions per input.
+        step: step of the differences.
     """
     rng, value = torch.Generator().manual_seed(0), f(*inputs)
     weights = torch.randn(value.shape, generator=rng, dtype=torch.float64).to(value)

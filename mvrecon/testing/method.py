@@ -36,10 +36,10 @@ def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None
     A method without parameters explains the views better than an empty volume.
 
     Args:
-        name: of the method.
+        name: name of the method.
         A: the operator; at least two cameras.
-        seed: of weights and volumes.
-        options: of the method.
+        seed: seed of weights and volumes.
+        options: options of the method.
     """
     torch.manual_seed(seed)
     method = build_method({"name": name, **options}).eval()
@@ -149,9 +149,9 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
     samples; gradients reach every parameter.
 
     Args:
-        name: of the network.
-        seed: of weights and input.
-        options: of the network.
+        name: name of the network.
+        seed: seed of weights and input.
+        options: options of the network.
     """
     torch.manual_seed(seed)
     network = network_by_name({"name": name, **options}, 2, 3, zero=1).eval()
@@ -179,11 +179,11 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
     `keeps_views = True`, the measured views for any logits and prior, zero on zero rays.
 
     Args:
-        name: of the head.
-        frusta: at least two rows; the rays of the last row are made to miss the region, with views
-            of noise.
-        seed: of logits, prior and views.
-        options: of the head.
+        name: name of the head.
+        frusta: frusta with at least two rows; the rays of the last row are made to miss the region,
+            with views of noise.
+        seed: seed of logits, prior and views.
+        options: options of the head.
     """
     torch.manual_seed(seed)
     head = HEADS.build(name, **options)
@@ -237,9 +237,9 @@ def check_weighting(name: str, seed: int = 0, **options: Any) -> None:
     and cells that no camera sees. Gradients reach every parameter.
 
     Args:
-        name: of the weighting network.
-        seed: of weights and inputs.
-        options: of the weighting network.
+        name: name of the weighting network.
+        seed: seed of weights and inputs.
+        options: options of the weighting network.
     """
     torch.manual_seed(seed)
     for channels in (len(CHANNELS), len(CHANNELS) - 1):

@@ -26,9 +26,9 @@ def check_scene(name: str, seed: int = 0, **options: Any) -> None:
     seeds differ.
 
     Args:
-        name: of the scene.
-        seed: of the series of cases.
-        options: of the scene.
+        name: name of the scene.
+        seed: seed of the series of cases.
+        options: options of the scene.
     """
     scene = SCENES.build(name, **options)
     assert isinstance(scene, Scene), f"{name!r} is no subclass of mvrecon.data.scenes.sample.Scene"

@@ -43,7 +43,7 @@ class StepProgress(ProgressBar):
     """One line for each method: steps, elapsed and remaining time, loss, last validation PSNR.
 
     Args:
-        label: of the method in the run's table; "" if not yet known.
+        label: label of the method in the run's table; "" if not yet known.
     """
 
     def __init__(self, label: str = "") -> None:
@@ -207,7 +207,7 @@ class CompileModel(L.Callback):
     training.
 
     Args:
-        mode: of `torch.compile`; "reduce-overhead" records CUDA graphs.
+        mode: mode of `torch.compile`; "reduce-overhead" records CUDA graphs.
     """
 
     def __init__(self, mode: str | None = None):

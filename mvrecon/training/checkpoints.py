@@ -49,10 +49,10 @@ class TrainingState(TypedDict, total=False, extra_items=Any):
 
     Attributes:
         state_dict, current_model_state: weights; of averages those that are trained on.
-        hyper_parameters: of `ReconstructionModule`.
+        hyper_parameters: arguments of `ReconstructionModule`.
         callbacks: states by name.
         loops: progress.
-        gradients: of every process, in an accumulation that is not finished.
+        gradients: gradients of every process, in an accumulation that is not finished.
     """
 
     state_dict: dict[str, Tensor]

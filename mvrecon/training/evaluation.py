@@ -60,11 +60,11 @@ def evaluate(
     if any).
 
     Args:
-        methods: by label.
+        methods: the methods by label.
         batches: test scenes, in batches of any size; the methods get them one by one.
         A: the operator of the views.
-        data_range: for PSNR and SSIM.
-        device: of the methods.
+        data_range: range of the true values, for PSNR and SSIM.
+        device: device of the methods.
         on_scene: called with every scene and its reconstructions by label.
         assumed: operators, by label, of methods that assume another one than A.
 
@@ -179,13 +179,13 @@ def results(
     """Compute the result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
     Args:
-        settings: of the run, or of an evaluation.
-        folder: of the run.
-        data: with the test scenes.
-        device: of the methods.
+        settings: settings of the run, or of an evaluation.
+        folder: folder of the run.
+        data: data with the test scenes.
+        device: device of the methods.
         on_scene: called with every scene and its reconstructions by label.
         other_rig: allow another rig and grid, those of `settings`, than in training.
-        ready: of `loaded`; None: load it.
+        ready: what `loaded` returns; None: load it.
 
     Raises:
         FileNotFoundError: training of a method has not finished.
@@ -280,8 +280,8 @@ def seen_in_training(
     store its training cases.
 
     Args:
-        methods: of the run.
-        names: of the scenes.
+        methods: methods of the run.
+        names: names of the scenes.
         truths: digests of their volumes, which identify training cases under any name.
     """
     trained = [method for method in methods if method.steps]

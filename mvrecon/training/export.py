@@ -70,14 +70,14 @@ def save_views(
     with the attributes `dose` and `duration` (s), and `unit_per_dose`, that of counts / dose.
 
     Args:
-        folder: of all cases.
-        name: of the case and its subfolder, which is returned.
+        folder: folder of all cases.
+        name: name of the case and its subfolder, which is returned.
         views: line integrals, or another projector's output.
-        unit: of the views.
+        unit: unit of the views.
         attenuated: whether they are counts that the map of `save_mu`, else `projector.mu`,
             attenuated.
         dose: expected counts per unit of the views; None: they are no counts.
-        duration_s: of the measurement of counts; None: unknown.
+        duration_s: duration of the measurement of counts, in s; None: unknown.
 
     Raises:
         ValueError: a dose or a duration that is not positive and finite, or views that are not
@@ -153,8 +153,8 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
     Convention: RTK's; the first row is the lowest one, opposite to `views`.
 
     Args:
-        folder: of all cases.
-        name: of the case.
+        folder: folder of all cases.
+        name: name of the case.
         views: line integrals of attenuation.
 
     Raises:

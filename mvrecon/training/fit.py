@@ -135,9 +135,9 @@ def check(settings: TrainSettings, data: SceneData, folder: Path, again: bool = 
     With several devices each process computes its own training cases, later.
 
     Args:
-        settings: of the run.
-        data: of `build_data`.
-        folder: of the run.
+        settings: settings of the run.
+        data: what `build_data` returns.
+        folder: folder of the run.
         again: whether finished methods are trained further.
 
     Raises:

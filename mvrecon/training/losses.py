@@ -146,7 +146,7 @@ class ReconstructionLoss(nn.Module):
 
     Args:
         data_range: value range of the volumes, in their unit.
-        weights: of terms by name; 0 disables one. That of the volume is 1 if not given.
+        weights: weight of each term, by name; 0 disables one. That of the volume is 1 if not given.
 
     Raises:
         TypeError: an unknown term, or a data range that is not a number.
@@ -172,7 +172,7 @@ class ReconstructionLoss(nn.Module):
         """Return each unweighted term that the reconstruction has, and the weighted sum as "total".
 
         Args:
-            out: of the method.
+            out: the method's reconstruction.
             batch: "volume"; if weighted, "common_field" [1 d h w], the voxels that all cameras
                 see; and all that plugins' terms read.
 

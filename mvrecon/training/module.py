@@ -36,7 +36,7 @@ class Schedule(TypedDict, total=False):
 
     Args:
         lr: greatest learning rate of the schedule.
-        schedule: of the learning rate.
+        schedule: course of the learning rate over the steps: cosine, one_cycle or constant.
         warmup: share of the steps with a rising rate.
     """
 
@@ -193,7 +193,7 @@ class ReconstructionModule(L.LightningModule):
         """Reconstruct views [b 1 m v u] by the method.
 
         Args:
-            views: in the operator's unit.
+            views: the views, in the operator's unit.
             A: the operator of the views; None: that of the run.
         """
         return self.method(views, self.projector if A is None else A)

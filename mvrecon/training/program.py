@@ -34,7 +34,7 @@ def exported(
     `mvrecon.operators.torch_ops` before loading it.
 
     Args:
-        method: in evaluation mode.
+        method: a method in evaluation mode.
         A: the operator.
         views: example of the program's shape, dtype and device, with any values.
 
@@ -72,8 +72,8 @@ def save_program(
     The archive's `extra/load.py` has the import that must precede `torch.export.load`.
 
     Args:
-        run: as the `path` of `mvrecon.load`.
-        path: of the file, which ends with .pt2; `torch.export.load` reads it.
+        run: as `path` of `mvrecon.load`.
+        path: path of the file, which ends with .pt2; `torch.export.load` reads it.
         method: its label in the run's table; None: the run's main method.
         batch: number of samples per call.
 

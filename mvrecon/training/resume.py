@@ -41,7 +41,7 @@ class KeepLast(Checkpoint):
     only: several get it at different steps, and stop at once).
 
     Args:
-        path: of the checkpoint; the previous one stays beside it.
+        path: path of the checkpoint; the previous one stays beside it.
     """
 
     of_every_run = True
@@ -225,8 +225,8 @@ def extended(settings: TrainSettings, folder: Path, steps: int) -> TrainSettings
     """Return a run's settings with more steps; writes nothing.
 
     Args:
-        settings: of the run.
-        folder: of the run.
+        settings: settings of the run.
+        folder: folder of the run.
         steps: the new `trainer.max_steps`.
 
     Raises:
@@ -253,9 +253,9 @@ def extend_training(settings: TrainSettings, longer: TrainSettings, folder: Path
     is removed.
 
     Args:
-        settings: of the run.
-        longer: of `extended`.
-        folder: of the run.
+        settings: settings of the run.
+        longer: the longer run's settings, as `extended` returns them.
+        folder: folder of the run.
 
     Raises:
         RuntimeError: another process uses the folder.

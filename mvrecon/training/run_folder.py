@@ -40,9 +40,9 @@ def run_lock(
     corrected command may use the folder.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         settings: plain.
-        file: of the settings.
+        file: name of the settings' file.
         products: files that a failing run removes, if they are new.
 
     Raises:

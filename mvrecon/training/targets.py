@@ -89,7 +89,7 @@ def inside(path: str | os.PathLike[str], folder: Path, what: str) -> Path:
     """Resolve a path's links and check that it lies inside a folder.
 
     Args:
-        path: to a file or a folder, existing or not.
+        path: path of a file or a folder, existing or not.
         folder: the run folder.
         what: name of the path, for the message.
 

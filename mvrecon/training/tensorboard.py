@@ -45,7 +45,7 @@ class TensorBoardReview(L.Callback):
         every: number of validations between sheets.
         cases: number of scenes, from the first batch.
         baselines: training-free methods for comparison.
-        label: of the method in the run's table; "": its class's name.
+        label: label of the method in the run's table; "": its class's name.
     """
 
     def __init__(
@@ -254,11 +254,11 @@ class Slices:
     repeats the middle slice, which is also written to `review/test`.
 
     Args:
-        folder: of the run.
-        settings: of the run; nothing is logged without TensorBoard.
-        grid: of the volumes.
-        data_range: of the values.
-        unit: of the values.
+        folder: folder of the run.
+        settings: settings of the run; nothing is logged without TensorBoard.
+        grid: grid of the volumes.
+        data_range: range of the values.
+        unit: unit of the values.
     """
 
     def __init__(

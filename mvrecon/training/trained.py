@@ -88,8 +88,8 @@ class Trained:
 
     Args:
         module: the method with its weights.
-        seconds: of training.
-        steps: of the optimiser.
+        seconds: duration of the training, in s.
+        steps: number of steps of the optimiser.
         cases: names of the training cases; None if the checkpoint does not store them.
         digests: SHA-256 of the training's rig and files.
         volumes: SHA-256 of the training cases' volumes.
@@ -144,8 +144,8 @@ class Trained:
         Args:
             views: measured.
             A: the operator.
-            name: of the method, for warnings.
-            fallback: of a network that was trained on many rigs, return the classical start where
+            name: name of the method, for warnings.
+            fallback: for a network that was trained on many rigs, return the classical start where
                 that predicts left-out views better. The check costs three more reconstructions.
 
         Warns:
@@ -236,8 +236,8 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     on another rig and grid.
 
     Args:
-        path: of a checkpoint, of weights (.safetensors) or of a run folder, whose setting `plugins`
-            names modules to import; or the name of weights that are part of mvrecon.
+        path: path of a checkpoint, of weights (.safetensors) or of a run folder, whose setting
+            `plugins` names modules to import; or the name of weights that are part of mvrecon.
         method: its label in the run's table; None: the run's main method. Ignored for a checkpoint,
             which holds one method.
 
@@ -294,8 +294,8 @@ def save_weights(run: str | Path | Trained, path: str | Path, method: str | None
     `sha256`, that of the whole file with zeros in its place.
 
     Args:
-        run: as the `path` of `load`, or its result.
-        path: of the file, which ends with .safetensors.
+        run: as `path` of `load`, or its result.
+        path: path of the file, which ends with .safetensors.
         method: its label in the run's table; None: the run's main method.
 
     Returns:
@@ -331,7 +331,7 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
 
     Args:
         path: as in `load`: a run (its main method), a checkpoint or a weights file.
-        module: with the same method.
+        module: a module with the same method.
 
     Raises:
         ValueError: weights of another method; and as `load`.

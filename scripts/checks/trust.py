@@ -102,7 +102,9 @@ STEPS: tuple[Callable[[argparse.Namespace], Rows], ...] = (stress, properties, f
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=7, help="of all that is random (default: 7)")
+    parser.add_argument(
+        "--seed", type=int, default=7, help="seed of all that is random (default: 7)"
+    )
     parser.add_argument(
         "--fuzz", type=int, default=9000, help="damaged files for each reader (default: 9000)"
     )

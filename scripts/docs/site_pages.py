@@ -53,6 +53,7 @@ STYLE = """@media (min-width: 76em) {
   white-space: pre-wrap;
 }
 .md-typeset td > a > code { white-space: nowrap; }
+.md-typeset td:first-child > code { word-break: normal; }
 """
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 #: A Markdown link with its target, without its anchor.

@@ -8,7 +8,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from mvrecon.apps.list import main
+from mvrecon.apps.list import SETTING, listed, main
 from mvrecon.core import registry
 from mvrecon.core.parts import LISTED, LOSSES, METRICS, REGISTRIES
 from mvrecon.core.signatures import REQUIRED, describe
@@ -102,13 +102,26 @@ def test_settings_and_named_parts_of_training_are_listed(capsys):
         return " ".join(capsys.readouterr().out.split())
 
     assert "weight_decay=0.01" in text("optimizer")  # of AdamW, read through torch's own imports
-    assert "alternations=4 of reconstruction and alignment." in text("setting")
+    assert "alternations=4 number of alternations of reconstruction and" in text("setting")
     assert "acquisition" in text("setting") and "grid" in text("setting")
     assert "ItkViews" in text("views")
     with pytest.raises(SystemExit) as end:
         main(["logger"])
     assert end.value.code == 0
     assert "No logger is registered; plugins can add some." in capsys.readouterr().err
+
+
+def test_no_text_of_an_option_needs_its_name():
+    """Such as "of the detector" in place of "blur of the detector"."""
+    texts = {
+        f"{part.kind} {part.name} {name}": option.text
+        for kind in (None, SETTING)
+        for part in listed(kind)
+        for name, option in part.options.items()
+        if option.text
+    }
+    assert len(texts) > 300
+    assert not [name for name, text in texts.items() if text.startswith(("of ", "for ", "at "))]
 
 
 def test_every_metric_and_loss_is_listed_with_its_unit(tmp_path, monkeypatch, capsys):

@@ -436,3 +436,18 @@ def test_an_nrrd_with_more_values_than_it_declares_is_refused(encoding, tmp_path
     path.write_bytes(text)
     with pytest.raises(Refused, match="expected 48 bytes of values"):
         read_volume(path)
+
+
+@pytest.mark.parametrize("key", ["dimension", "line_skip", "byte_skip"])
+@pytest.mark.parametrize("text", ["\xff", "3.5", "1e1", "1_0", "\u0663", "3 3", "0x3", "9" * 20])
+def test_a_number_of_nrrd_that_is_not_whole_is_refused_by_name(key, text, tmp_path):
+    """Also those that Python alone reads: 1_0 and the digits of other scripts."""
+    with pytest.raises(
+        Refused, match=rf"a\.nrrd: expected a whole number as {key.replace('_', ' ')}"
+    ):
+        read_volume(nrrd(tmp_path / "a.nrrd", **{key: text}))
+
+
+def test_more_lines_to_skip_than_there_are_are_refused(tmp_path):
+    with pytest.raises(Refused, match=r"a\.nrrd: expected 99999 lines to skip, got fewer"):
+        read_volume(nrrd(tmp_path / "a.nrrd", line_skip="99999"))

@@ -280,7 +280,7 @@ def to_plain(config: DictConfig, choices: Mapping[str, str | None] | None = None
     """A composed config as plain dicts, lists, strings and numbers, with references resolved.
 
     Args:
-        config: without Hydra's section.
+        config: a composed config without Hydra's section.
         choices: file by config group: a null `label` becomes the name of the main method's.
 
     Raises:
@@ -302,7 +302,7 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
 
     Args:
         settings: whose plugins are imported.
-        record: of the app's settings.
+        record: the type of the app's settings.
     """
 
     return with_paths(

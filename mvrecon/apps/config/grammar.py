@@ -39,8 +39,8 @@ class CommandLine:
 
     Args:
         flags: such as `--cfg` and `job`.
-        overrides: in Hydra's grammar, without folders of configs.
-        folders: of configs from elsewhere.
+        overrides: changes in Hydra's grammar, without folders of configs.
+        folders: folders of configs from elsewhere.
     """
 
     flags: list[str]
@@ -59,11 +59,11 @@ class CommandLine:
         quoted where Hydra's grammar needs it.
 
         Args:
-            arguments: as typed.
-            sections: of settings whose options are set whether the app's own file has them or not,
-                as by Hydra's ++.
-            names: of settings that are texts.
-            tables: of sections of entries by name, of which one that is there may become null.
+            arguments: the words as typed.
+            sections: sections of settings whose options are set whether the app's own file has them
+                or not, as by Hydra's ++.
+            names: names of settings that are texts.
+            tables: sections with entries by name, of which one that is there may become null.
 
         Raises:
             PermissionError: a flag that chooses configs of other apps, or that unpickles a file.
@@ -153,8 +153,8 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
     """A typed value in Hydra's grammar.
 
     Args:
-        key: of the setting.
-        value: as typed; an existing path is one text, whatever is in its name.
+        key: name of the setting.
+        value: the value as typed; an existing path is one text, whatever is in its name.
         names: settings of the app that are texts, also where a number is typed.
         sweeps: whether commas separate the values of a sweep.
     """

@@ -40,8 +40,8 @@ def store_foreign(
     """Store the files of folders from elsewhere as choices of their groups, in this process only.
 
     Args:
-        folders: with files <group>/<name>.yaml.
-        groups: of configs.
+        folders: folders with files <group>/<name>.yaml.
+        groups: groups of configs.
         taken: f("<group>/<name>"), whether mvrecon's own choices have this name.
 
     Raises:
@@ -92,8 +92,8 @@ def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
     """Check the plain values of a file from elsewhere.
 
     Args:
-        values: of the file.
-        path: of the file.
+        values: the file's content.
+        path: path of the file.
         whole: whether they are an app's settings; else the options of a part.
 
     Raises:

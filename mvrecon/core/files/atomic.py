@@ -27,7 +27,7 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
     temporary file of a killed process, `.<name>.<process>.part`, is removed by the next `claimed`.
 
     Args:
-        path: of the file.
+        path: path of the file.
         previous: new path of an existing file; None: deleted. At any moment one of both paths holds
             a complete file.
 
@@ -76,7 +76,7 @@ def check_room(path: Path, size: int) -> None:
     """Check the free space of the file system of a path, which may not exist yet.
 
     Args:
-        path: to write.
+        path: path to be written.
         size: bytes.
 
     Raises:
@@ -97,7 +97,7 @@ def written_or_kept(path: Path, write: Callable[[Path], None], places: Sequence[
     """Write a file whose contents must not be lost; if that fails, write it elsewhere, and raise.
 
     Args:
-        path: of the file.
+        path: path of the file.
         write: writes the file at a path with the same name; raises OSError or, as ITK,
             RuntimeError.
         places: existing folders that are tried in turn; the file goes into a new folder there.

@@ -76,9 +76,9 @@ def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict
     """The UTF-8 text of a file.
 
     Args:
-        path: of the file.
+        path: path of the file.
         limit: most bytes.
-        errors: as of `bytes.decode`: "surrogateescape" keeps bytes of older encodings.
+        errors: as in `bytes.decode`: "surrogateescape" keeps bytes of older encodings.
 
     Raises:
         OSError: it cannot be read.
@@ -165,7 +165,7 @@ def plain_name(name: Any, where: str | Path) -> str:
     """Check that a name is a valid file or folder name, and not a path; return it.
 
     Args:
-        name: to check.
+        name: name to be checked.
         where: its origin, for the message.
 
     Raises:
@@ -231,11 +231,11 @@ def check_declared(
     """Check a volume's declared size against the file of its values, before allocating memory.
 
     Args:
-        path: of the header, for the message.
+        path: path of the header, for the message.
         shape: voxels along each axis.
         itemsize: bytes of a value in the file.
         data: the file with the values.
-        offset: of the first value in it, in bytes.
+        offset: position of the first value in the file, in bytes.
         packed: whether the values are deflated.
         working: minimum bytes of a value in memory.
 

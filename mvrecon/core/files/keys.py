@@ -15,11 +15,11 @@ class Key(NamedTuple):
     """A key of a format's header.
 
     Args:
-        name: as the format spells it, or several, separated by ", ".
+        name: the key as the format spells it, or several, separated by ", ".
         use: "applied" to values or geometry; "compared" with what it repeats, and refused where it
             contradicts that; "refused" unless its value is one of `allowed`; or "ignored", for the
             reason in `note`.
-        note: for the table, in a few words.
+        note: a few words for the table.
         allowed: values of a refused key that change nothing; a missing key is always accepted.
     """
 
@@ -70,8 +70,8 @@ def check_keys(path: str | Path, keys: Sequence[Key], value_of: Callable[[str], 
     """Check the refused keys of a header.
 
     Args:
-        path: of the file, for the message.
-        keys: of its format.
+        path: path of the file, for the message.
+        keys: keys of its format.
         value_of: value of a key by its name; None or empty if it is missing. Texts are compared
             regardless of case, and as numbers where they are numbers.
 

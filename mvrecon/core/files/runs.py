@@ -49,8 +49,9 @@ class Results(TypedDict, total=False):
     Attributes:
         truths: mean and root mean square of each true volume.
         acquisition: options of the views' detector.
-        units: of the figures, by name.
-        checkpoint, acquisition_of_run, geometry, geometry_of_run: of an evaluation.
+        units: unit of each figure, by name.
+        checkpoint, acquisition_of_run, geometry, geometry_of_run: only in an evaluation: path of
+            the checkpoint; the detector of the run; rig and grid of the evaluation and of the run.
     """
 
     name: str

@@ -134,9 +134,10 @@ class Acquired(Scene):
         was projected; None for integrals in closed form.
 
         Args:
-            index, seed, grid: as `sample`.
+            index, seed, grid: as in `sample`.
             rig: the true cameras.
-            amplitudes_mm: of the breathing object in each view; empty: at rest in all.
+            amplitudes_mm: amplitude of the breathing object in each view, in mm; empty: at rest in
+                all.
 
         Raises:
             ValueError: as `sample`.
@@ -197,8 +198,8 @@ def source_of(
 
     Args:
         projector: name and options.
-        grid: of the true volume.
-        cameras: of the run.
+        grid: grid of the true volume.
+        cameras: cameras of the run.
         fine: refinement factor of the projector's grid.
         closed_form: use the scene's own line integrals for projectors of these.
         rays: finer pixels each way in one, on the finer grid, if the projector supports them.

@@ -78,9 +78,9 @@ def breathing_views(
     """Views of an object, each of the object deformed by an amplitude of its own.
 
     Args:
-        A: of the volume's grid.
+        A: the operator on the volume's grid.
         volume: the object at rest.
-        amplitudes_mm: of each view; 0: at rest, empty: all at rest.
+        amplitudes_mm: amplitude of the object in each view, in mm; 0: at rest, empty: all at rest.
 
     Raises:
         ValueError: as `breathed`, or a projector that attenuates the object by a map, which does

@@ -31,14 +31,14 @@ class Acquisition:
             at least 2. Ignored for line integrals: an analytic phantom has them in closed form, a
             file's scene its own option `fine`.
         rays: lines each way over a pixel, whose mean it measures on the finer grid; as `fine`.
-        blur_mm: of the detector, full width at half maximum of a Gaussian.
+        blur_mm: blur of the detector: full width at half maximum of a Gaussian, in mm.
         scatter: share of the primary that is added, blurred. With `photons` it is a share of the
             intensity times its line integral, y exp(-y), so that air scatters nothing (Ohnesorge,
             Flohr, Klingenbeck-Regn, Eur. Radiol. 9 (1999) 563, convolve weighted projections
             likewise).
         scatter_mm: blur of the scattered part, full width at half maximum of a Gaussian.
-        photons: of an unattenuated pixel (I0); the views are -log of Poisson numbers per I0, at
-            least half a photon. inf: no noise. None: views are not intensities.
+        photons: number of photons of an unattenuated pixel (I0); the views are -log of Poisson
+            numbers per I0, at least half a photon. inf: no noise. None: views are not intensities.
         counts: total of all views of a case without gains and losses; the views are Poisson
             numbers, divided by their dose (expected counts per unit) to be in the projector's unit;
             the views.h5 of `mvrecon-simulate` holds the counts themselves. None: no counts.
@@ -46,8 +46,8 @@ class Acquisition:
             attenuation is that at 70 keV. Requires `photons`, whose number is that of the mean
             signal's. None: photons of one energy.
         integrating: the detector sums the energies of the photons of `kv`; False: it counts them.
-        duration_s: of the measurement of `counts`, in s, stored with them: estimates of scatter
-            from another file scale its counts to the same duration.
+        duration_s: duration of the measurement of `counts`, in s, stored with them: estimates of
+            scatter from another file scale its counts to the same duration.
         noise: standard deviation of the electronics, Gaussian and additive: in photons with
             `photons`, in counts with `counts`, else in the views' unit.
         closed_form: use a scene's own closed-form line integrals; False: project on the finer grid,
@@ -149,7 +149,7 @@ class Detected(NamedTuple):
     """Measured views of one case.
 
     Args:
-        views: in the unit of the ideal ones.
+        views: measured views, in the unit of the ideal ones.
         dose: expected counts per unit, by which counts were divided; None: no counts.
     """
 
@@ -180,9 +180,9 @@ def measured(
 
     Args:
         views: line integrals without a unit with photons, else in the projector's unit.
-        acquisition: of the detector.
+        acquisition: options of the detector.
         cameras: give the size of pixels in mm.
-        rng: of the noise.
+        rng: generator of the noise.
         intended: the views without gains and losses, whose counts set the exposure: a blocked
             pinhole leaves the others as many as before. None: `views`.
         extra_scatter: scatter-to-primary ratio of each view beside the acquisition's.

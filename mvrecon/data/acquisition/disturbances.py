@@ -19,7 +19,8 @@ class RigErrors:
     """The errors of the views of one case.
 
     Args:
-        shift_px: of each detector along its columns' and its rows' direction (u, v), in pixels.
+        shift_px: shift of each detector along its columns' and its rows' direction (u, v), in
+            pixels.
         gain: factor of each view; 0 where the view is lost.
         tilt_deg: rotations of each detector about its centre, as those of `Misalignment`.
         motion_mm: displacement of the object in each view, along x, y and z.
@@ -65,9 +66,9 @@ class RigErrors:
         detector (u, v) in pixels: the mean over the object's voxels, weighted by their values.
 
         Args:
-            cameras: as stated.
+            cameras: the rig as stated.
             volume: the object, zero or more.
-            grid: of the volume.
+            grid: grid of the volume.
         """
         points = voxel_centres(grid).reshape(-1, 3)
         stated, true = (
@@ -152,11 +153,14 @@ class Disturbance:
     Args:
         views: number of views, drawn for each case, with all errors but `lost`; `rod`, `scatter`,
             `dead` and `breathing_mm` are each drawn for as many views of their own.
-        shift_px: of the detector along columns and rows, uniform in +-this.
-        gain: of the views' values, 1 + a number uniform in +-this.
-        tilt_deg: of the detector about its centre, rotations about its columns' and rows'
-            directions and its normal, each uniform in +-this.
-        motion_mm: of the object during the view, along x, y and z, each uniform in +-this.
+        shift_px: largest shift of the detector along columns and rows, in pixels; uniform in
+            +-this.
+        gain: largest relative error of the views' values, which are multiplied by 1 + a number
+            uniform in +-this.
+        tilt_deg: largest rotation of the detector about its centre, in degrees: about its columns'
+            and rows' directions and its normal, each uniform in +-this.
+        motion_mm: largest displacement of the object during the view, in mm: along x, y and z, each
+            uniform in +-this.
         saturated: share of a view's greatest value at which an overexposed detector clips.
         truncated: share of a detector's columns, at its left or right end, that read zero.
         rod: greatest value of the shadow of a rod in the beam, such as a cable or metal, as a share
@@ -170,7 +174,7 @@ class Disturbance:
             thirds or all of an amplitude of the case, uniform from an eighth of this to this; all
             other views, and the true volume, are at rest. See `mvrecon.data.acquisition.breathing`.
         lost: number of views, drawn independently, that read zero everywhere.
-        probability: that each of the drawn views is faulty, or lost; 1: all are.
+        probability: probability with which each of the drawn views is faulty, or lost; 1: all are.
 
     Raises:
         TypeError: an option that is no number.

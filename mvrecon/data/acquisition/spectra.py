@@ -32,8 +32,8 @@ class Spectrum(NamedTuple):
     """A beam in matter that attenuates as water does.
 
     Args:
-        weights: of the energies in the detector's signal, which sum to one.
-        attenuation: at these energies, relative to that at 70 keV.
+        weights: share of each energy in the detector's signal; they sum to one.
+        attenuation: attenuation at these energies, relative to that at 70 keV.
     """
 
     weights: Float[Tensor, " e"]

@@ -246,8 +246,8 @@ def warn_of_others(
     """Warn of a field that was taken with another exposure, or in another beam, than its views.
 
     Args:
-        views: as they are stored.
-        field: of theirs.
+        views: the views as they are stored.
+        field: their dark or flat field.
         name: "flat", or "dark", for which only times count.
         applied: attributes that `relative_exposure` applies, and to which it compares others.
     """

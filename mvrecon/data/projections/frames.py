@@ -36,7 +36,7 @@ class Frames:
     """Frames [n v u] of one data set, or of those that a virtual one consists of.
 
     Args:
-        place: of the data set; one image is one frame.
+        place: place of the data set; one image is one frame.
         folder: other files must be in it, or below.
 
     Raises:
@@ -134,12 +134,12 @@ class FrameViews(ProjectionStack):
 
     Args:
         frames: all of them.
-        numbers: of these.
+        numbers: numbers of the frames that are views.
         fields: flat and dark fields.
-        rig: that the file states.
+        rig: the rig that the file states.
         folder: other files must be in it, or below.
-        stated: of the exposure and the beam of all frames, by name: a text for each, "" of none.
-        marked: bad pixels.
+        stated: exposure and beam of all frames by name, a text for each, "" if none is stated.
+        marked: mask of bad pixels.
         top: greatest grey value; None: that of the type.
     """
 

@@ -153,7 +153,7 @@ class ImageFiles(ProjectionStack):
     """Views as images, one in each file, or all in one file of several pages.
 
     Args:
-        files: in the order of the views.
+        files: the views' files, in their order.
 
     Raises:
         Refused: images of several sizes or types, colours, a file that is damaged, or one with a
@@ -251,9 +251,9 @@ def view_files(
     images, else by the numbers in their names.
 
     Args:
-        folder: of the images; names of `FIELDS` are excluded, unless all are. Other files are
-            ignored.
-        pattern: of the names of the views, such as "scan_*.tif"; None: all images.
+        folder: folder of the images; names of `FIELDS` are excluded, unless all are. Other files
+            are ignored.
+        pattern: pattern of the views' names, such as "scan_*.tif"; None: all images.
         gaps: see `ordered`.
         fields: files of dark and flat fields, which are excluded.
 

@@ -134,7 +134,7 @@ def hdf5_views(
     Links are followed to other files in the file's folder, and below.
 
     Args:
-        path: of the file.
+        path: path of the file.
         dataset: name of the frames [m v u]; None: those beside an image_key, or /exchange/data.
         angles: name of the angles, of all frames or of the views, in this file or as
             "<file>:<name>" in another; None: rotation_angle of NXtomo, theta of Data Exchange, if

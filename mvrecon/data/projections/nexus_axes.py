@@ -42,9 +42,9 @@ def degrees_of(angles: Place, kept: np.ndarray, expected: str) -> list[float]:
     """The angles of the cameras of views in degrees.
 
     Args:
-        angles: of all frames, or of the views.
+        angles: place of the angles of all frames, or of the views.
         kept: whether a frame is a view.
-        expected: for messages.
+        expected: what should be there, for messages.
 
     Warns:
         UserWarning: angles of a unit that look like another.

@@ -13,7 +13,7 @@ class NikonViews(ImageFiles):
     and its rig.
 
     Args:
-        path: of the .xtekct.
+        path: path of the .xtekct.
 
     Raises:
         FileNotFoundError: nothing is there.

@@ -50,11 +50,11 @@ def open_projections(
 
     Args:
         path: a folder, or a file.
-        pattern: of the names of the views in a folder, such as "scan_*.tif"; None: all images.
+        pattern: pattern of the views' names in a folder, such as "scan_*.tif"; None: all images.
         gaps: allow numbers in unequal steps in a folder.
         fields: dark and flat fields, whose files in the folder are not views.
         layout: "sinogram": images of slices with the angles as rows.
-        names: of data sets in the file; see `hdf5_views`.
+        names: names of data sets in the file; see `hdf5_views`.
 
     Warns:
         UserWarning: names that differ in more than their numbers, chosen by a pattern or none
@@ -133,11 +133,12 @@ def exposures(
     """The exposure of each view relative to the flat field's; see `Measured`.
 
     Args:
-        path: of a file of numbers, or names by which views and flat field state them, with `*`.
+        path: path of a file of numbers, or names by which views and flat field state them, with
+            `*`.
         stack: the views as they are stored.
         where: their path.
-        flat: of the options.
-        layout: of the views.
+        flat: the option `flat`.
+        layout: layout of the views.
 
     Raises:
         FileNotFoundError: nothing is there, and the views do not state it.
@@ -177,12 +178,12 @@ def mean_field(
     """A field in grey values: a number, the mean of images, or the folder's own.
 
     Args:
-        views: as they are stored.
+        views: the views as they are stored.
         where: their path.
         name: dark or flat.
-        value: of the options.
-        layout: of the views.
-        exposure: of the options.
+        value: the option of this name.
+        layout: layout of the views.
+        exposure: the option `exposure`.
 
     Warns:
         UserWarning: images of a flat field that differ, or a field of another exposure or beam than

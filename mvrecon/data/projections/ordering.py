@@ -28,7 +28,7 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     0.25.
 
     Args:
-        paths: of the files of one folder.
+        paths: paths of the files of one folder.
         gaps: allow unequal steps, as of views left out on purpose.
         mixed: allow several kinds of names, as chosen on purpose.
 

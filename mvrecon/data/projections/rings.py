@@ -24,8 +24,8 @@ def without_rings(
             replaces the values of each column, in the order of their size, by the median of
             neighbouring columns, for stripes that change with the object: algorithm 3 of Vo, Atwood
             and Drakopoulos, Optics Express 26, 28396, 2018, by algotom.
-        width: of a ring in pixels, at most; medians are of 2 width + 1 pixels. Details as narrow on
-            the axis of rotation, and walls around it, are removed, too.
+        width: greatest width of a ring, in pixels; medians are of 2 width + 1 pixels. Details as
+            narrow on the axis of rotation, and walls around it, are removed, too.
 
     Raises:
         ImportError: algotom is not installed, for "sorting".

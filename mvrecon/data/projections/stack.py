@@ -62,10 +62,10 @@ class ProjectionStack(ABC):
     """Projections of one size on disk, in grey values or line integrals as they are stored.
 
     Args:
-        path: of the file or folder, for messages.
-        names: of the views, in their order.
+        path: path of the file or folder, for messages.
+        names: names of the views, in their order.
         shape: rows and columns of a view.
-        dtype: of the pixels as they are stored.
+        dtype: type of the pixels as they are stored.
 
     Raises:
         Refused: no view or too many, or pixels that are not integers or floats.
@@ -225,7 +225,7 @@ class NpyViews(ProjectionStack):
     """Views in a NumPy file [m v u], or one view [v u], read partially.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -252,7 +252,7 @@ class ItkViews(ProjectionStack):
     uncompressed MHA and MHD are read partially.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         ImportError, FileNotFoundError, Refused: see `mvrecon.data.itk.itk_image`.
@@ -277,7 +277,7 @@ class Hdf5Views(ProjectionStack):
     """Line integrals, or counts with their dose, in a views.h5 as `mvrecon-simulate` writes it.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Raises:
         FileNotFoundError: nothing is there.

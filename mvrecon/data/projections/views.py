@@ -51,17 +51,17 @@ class Measured:
     Args:
         path: a folder of TIFF, PNG, DICOM or RTK's images, or a file: HDF5 (NeXus, Data Exchange,
             views.h5), Nikon's .xtekct, TIFF, .npy, .mha, .mhd, .nrrd; see `open_projections`.
-        kind: of the stored values: "integrals", used unchanged, "counts" of emission, which differ
-            in how pixels are joined (`binning`), or "intensities" (grey values), converted to -ln
-            of the transmission. None: as views.h5 states, counts for Interfile and DICOM NM,
+        kind: kind of the stored values: "integrals", used unchanged, "counts" of emission, which
+            differ in how pixels are joined (`binning`), or "intensities" (grey values), converted
+            to -ln of the transmission. None: as views.h5 states, counts for Interfile and DICOM NM,
             intensities for integer pixels; required for other floats.
         dark: grey values without a beam: a number, or a path to images that are averaged. None: the
             folder's images whose names begin with dark, or else 0.
         flat: grey values without an object, as `dark`. None: the folder's images whose names begin
             with flat.
-        exposure: of each view on disk relative to that of the flat field (exposure time, or its
-            product with the tube's current): grey values above the dark field are divided by it. A
-            .npy, text with one number per line, a table with a column such as exposure, or
+        exposure: exposure of each view on disk relative to that of the flat field (exposure time,
+            or its product with the tube's current): grey values above the dark field are divided by
+            it. A .npy, text with one number per line, a table with a column such as exposure, or
             <file>:<column>, or <file>:<name> of a data set of an HDF5 file; or a name by which
             views and flat field state theirs, or several joined by `*`: count_time or control/data
             of NeXus, ExposureTime, ExposureInuAs and the like of DICOM; raises if others that they
@@ -82,7 +82,7 @@ class Measured:
             and it is not in the mask. None: the largest of the bits that a file states, or of its
             integer type; none for floats.
         rows: region of the detector, [first, one past the last]; None: all.
-        columns: of the region, as `rows`.
+        columns: columns of the detector's region, [first, one past the last]; None: all.
         linearise: coefficients c1, c2, ... of the polynomial c1 p + c2 p^2 + ... of the line
             integrals p that corrects beam hardening. In apps, "fit" fits it to the views, which
             must be those of a uniform object; see `fit_linearisation`.
@@ -94,17 +94,17 @@ class Measured:
         flip_columns: reverse the columns of every view: for mirrored images, such as of the
             detector's back. Those of Nikon's .xtekct are reversed without it.
         every: use the first view and every n-th after it.
-        pattern: of the names of the images in a folder, such as "scan_*.tif"; None: all.
+        pattern: pattern of the images' names in a folder, such as "scan_*.tif"; None: all.
         gaps: allow names whose numbers have unequal steps.
         layout: "projections", or "sinogram": the images are those of slices, from the uppermost
             down, with the angles as rows. None: projections, but of a single image the layout must
             be given.
-        dataset: of an HDF5 file, the name of the frames [m v u]; None: those of NXtomo or Data
-            Exchange. Of DICOM NM, with mvrecon-spect, window2, frame3 or window2/frame3.
-        angles: of an HDF5 file, the name of the angles, or <file>:<name> in another file; None:
-            those of NXtomo or Data Exchange.
-        image_key: of an HDF5 file, the name of the frames' keys, or <file>:<name>: 0 views, 1 flat
-            and 2 dark fields; None: that beside the frames, if any.
+        dataset: name of the frames [m v u] in an HDF5 file; None: those of NXtomo or Data Exchange.
+            In DICOM NM, with mvrecon-spect, window2, frame3 or window2/frame3.
+        angles: name of the angles in an HDF5 file, or <file>:<name> in another file; None: those of
+            NXtomo or Data Exchange.
+        image_key: name of the frames' keys in an HDF5 file, or <file>:<name> in another: 0 views, 1
+            flat and 2 dark fields; None: that beside the frames, if any.
 
     Raises:
         ValueError: an unknown kind or layout, or numbers out of range.
@@ -190,7 +190,7 @@ class MeasuredViews:
     """Views of one measurement as line integrals, corrected when read.
 
     Args:
-        options: of the files and their correction.
+        options: options of the files and of their correction.
 
     Warns:
         UserWarning: at the first reading, pixels that measure wrongly, with their places.

@@ -25,10 +25,11 @@ class Exposure:
     """Conversion of line integrals to 16-bit grey values.
 
     Args:
-        photons: of an unattenuated pixel (I0), with Poisson noise; None: no noise.
+        photons: number of photons of an unattenuated pixel (I0), with Poisson noise; None: no
+            noise.
         dark: grey value without a beam.
         flat: grey value without an object; the range up to 65535 is for noise.
-        seed: of the noise.
+        seed: seed of the noise.
 
     Raises:
         ValueError: grey values that do not fit into 16 bits, or no photons.
@@ -82,7 +83,7 @@ def write_projections(
 
     Args:
         folder: new, or empty.
-        integrals: of the views; an iterable is consumed one view at a time.
+        integrals: line integrals of the views; an iterable is consumed one view at a time.
         exposure: photons and grey values; None: 1e4 photons.
 
     Raises:

@@ -26,7 +26,7 @@ class AnalyticScene(Scene):
         field: radius of the sphere about the grid's centre that contains the object, as a fraction
             of the grid's shortest edge.
         value: the greatest value; the least is 0.
-        unit: of the value.
+        unit: unit of the value.
 
     Raises:
         ValueError: a field outside (0, 0.5], or a value that is not positive.

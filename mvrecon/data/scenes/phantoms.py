@@ -62,16 +62,16 @@ def derenzo(
     spacing 2 d; row n from the tip has n rods (Derenzo, IEEE Trans. Nucl. Sci. 24 (1977) 544).
 
     Args:
-        well_diameters: of the six sectors in mm, counter-clockwise seen from the phantom's +z, the
-            first about its +x.
-        radius: of the phantom in mm.
-        height: of the rods in mm, from end to end.
-        centre: in world mm.
+        well_diameters: rod diameter of each of the six sectors in mm, counter-clockwise seen from
+            the phantom's +z, the first about its +x.
+        radius: radius of the phantom, in mm.
+        height: length of the rods, in mm.
+        centre: centre of the phantom, world mm.
         euler_degrees: (phi, theta, psi) of R_z(phi) R_y(theta) R_z(psi), from the phantom's axes to
             the world's.
-        value: in the rods.
-        background: between the rods, as a fraction of `value`; above zero it fills the phantom's
-            cylinder.
+        value: value in the rods.
+        background: value between the rods, as a fraction of `value`; above zero it fills the
+            phantom's cylinder.
 
     Raises:
         ValueError: sizes that are not positive, not six diameters, rods that do not fit, a
@@ -116,10 +116,10 @@ class RandomDerenzo(AnalyticScene):
     uniform in the field.
 
     Args:
-        well_diameters: of the six sectors, in mm.
-        radius_mm: of the phantom.
-        height_mm: of its rods, from end to end.
-        background: between the rods, as a fraction of `value`.
+        well_diameters: rod diameter of each of the six sectors, in mm.
+        radius_mm: radius of the phantom, in mm.
+        height_mm: length of its rods, in mm.
+        background: value between the rods, as a fraction of `value`.
         fill: least and greatest radius of the ball around the phantom, as fractions of the field's
             radius; the phantom is scaled to it, so that rods have the same size in voxels on every
             grid. None: sizes stay in mm.

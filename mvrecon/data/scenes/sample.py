@@ -35,7 +35,7 @@ class Sample:
             unit.
         volume: true values on the grid, float32.
         inside: the voxels that the object touches.
-        name: of the case, the same for the same (seed, index).
+        name: name of the case, the same for the same (seed, index).
         errors: unknown errors of each view by name, or empty.
         maps: further volumes of the case on the grid by name, such as its attenuation; part of a
             batch under their names.
@@ -58,7 +58,7 @@ class Scene(ABC):
 
     Attributes:
         data_range: the fixed range of values for PSNR and SSIM.
-        unit: of the volume's values.
+        unit: unit of the volume's values.
         length: number of cases; None: unlimited.
         map_names: names of the further volumes of `maps`, such as "mu".
         vary: cases beyond the last one are varied copies.
@@ -126,13 +126,13 @@ def phantom(
     """One case of a scene, such as a phantom, with its views: exact line integrals.
 
     Args:
-        name: of the scene, such as "shepp_logan", "ellipsoids" (random) or "derenzo";
+        name: name of the scene, such as "shepp_logan", "ellipsoids" (random) or "derenzo";
             `mvrecon-list scene` prints all.
-        grid: of the true volume.
-        cameras: that see it.
+        grid: grid of the true volume.
+        cameras: the rig that sees it.
         case: number of the case, of a scene with several.
-        seed: of the random scenes.
-        options: of the scene, such as `value`: the greatest value, 0.02 for water in 1/mm.
+        seed: seed of the random scenes.
+        options: options of the scene, such as `value`: the greatest value, 0.02 for water in 1/mm.
 
     Returns:
         A `Sample`: `views` [1 m v u] in value * mm and the true `volume` [1 d h w], both float32.

@@ -32,7 +32,7 @@ class Solids:
 
     Args:
         kind: "ellipsoid", "cylinder" (its axis is the solid's z), or "box".
-        centres: in world mm.
+        centres: centre of each solid, world mm.
         rotations: each solid's axes in the world, as columns.
         semi_axes: half lengths in mm along the solid's own x, y, z.
         values: value that each solid adds to the points inside it.

@@ -65,7 +65,7 @@ def from_krt(
     """Build the record from K, R and t, the inverse of `to_krt`.
 
     Args:
-        K, R, t: as from `to_krt`.
+        K, R, t: as `to_krt` returns them.
         shape: detector pixels (rows, columns).
         distance: mm from the source or pinhole to the detector, fx times the pixel pitch. K, R, t
             do not determine it; for a vision camera it is arbitrary.
@@ -143,7 +143,7 @@ def from_astra(
         vectors: rows as from `to_astra`.
         shape: detector pixels (rows, columns).
         parallel: the first three numbers are a ray's direction, with the record's depth as length.
-        extent: by default "segment", and "line" for parallel beams.
+        extent: which part of a ray counts; by default "segment", and "line" for parallel beams.
         flip_rows: reverse the detector's rows; the views' rows must be reversed with them.
 
     Convention: ASTRA's own circular geometries have v upwards (left-handed here): they need

@@ -63,7 +63,7 @@ def coverage(
 
     Args:
         cameras: the rig.
-        grid: of the voxels.
+        grid: grid of the voxels.
         weights: non-negative, of each voxel, such as a body's attenuation; None: all are equal.
             Shares of a zero volume are NaN.
 

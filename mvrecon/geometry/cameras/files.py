@@ -43,7 +43,8 @@ def from_file(path: str | Path | None) -> Cameras:
     [..], "v": [..]}, ..]}, with the fields of `Cameras`.
 
     Args:
-        path: of the file; null: in mvrecon-reconstruct, the rig that the views' own file states.
+        path: path of the file; null: in mvrecon-reconstruct, the rig that the views' own file
+            states.
 
     Returns:
         The rig, in float64 on the CPU.

@@ -80,7 +80,7 @@ def perturbed(
     Args:
         cameras: the ideal rig.
         offset_px, tilt_degrees, source_mm: standard deviation along or about each axis.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
 
     Raises:
         ValueError: as `misaligned`; parallel beams take `source_mm=0`.
@@ -127,12 +127,12 @@ def random_rig(
         n_views: number of cameras.
         sid: mm from the source to the origin.
         magnification: distance from source to detector, relative to `sid`.
-        pixels: of rows and of columns, one draw for each.
+        pixels: number of detector rows and of columns, one draw for each.
         field_mm: (v, u), extent of the detector demagnified to the origin.
         paths: kinds of rig, of `PATHS`: cameras on a full "circle" about z, on an "arc" of 90 to
             200 degrees, on a "dome" about +z that opens 90 to 180 degrees, or "scattered" over all
             azimuths and elevations up to 45 degrees, at distances that differ by up to a fifth.
-        seed: of the draws.
+        seed: seed of the draws.
 
     Returns:
         A rig; the same for the same seed.

@@ -383,7 +383,7 @@ def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
 
     Args:
         grid: the slices.
-        angles: of the full circle.
+        angles: number of angles on the full circle.
         bins: columns; None: enough for the diagonal of a slice.
 
     Raises:

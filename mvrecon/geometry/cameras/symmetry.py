@@ -24,7 +24,7 @@ class Mirror:
     G(A x).
 
     Args:
-        axis: of the volume, -3, -2 or -1 for (z, y, x), which F reverses.
+        axis: axis of the volume, -3, -2 or -1 for (z, y, x), which F reverses.
         partner: index of each camera's mirror image; its own if it lies on the plane.
         rows: whether a camera's rows are reversed in its partner's; otherwise its columns are.
     """

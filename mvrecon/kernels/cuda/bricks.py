@@ -18,8 +18,8 @@ class Prints(NamedTuple):
     """The views' footprints.
 
     Args:
-        numbers: of each view the map [3 4] from voxels about the grid's centre to (u w, v w, w), of
-            parallel beams (u, v, w); margin in pixels (u, v) of a footprint around its brick's
+        numbers: for each view, the map [3 4] from voxels about the grid's centre to (u w, v w, w),
+            of parallel beams (u, v, w); margin in pixels (u, v) of a footprint around its brick's
             image; its share of the ray; further growth in pixels (u, v). float64.
         window: valid range of a ray.
         parallel: whether beams are parallel.
@@ -34,7 +34,7 @@ class Rule(NamedTuple):
     """Criterion of an empty brick.
 
     Args:
-        edge: of a brick in voxels.
+        edge: edge of a brick, in voxels.
         reach: voxels by which interpolation extends a value beyond the faces of its voxel.
         enough: number of views that must prove it empty.
         keep_unseen: whether bricks stay that no view sees whole or with foreground.

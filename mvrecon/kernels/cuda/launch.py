@@ -64,9 +64,9 @@ class Source:
     Args:
         macro: defines the kernels, given (their suffix, type of arithmetic, stored type, volumes
             that share a ray's index work, method of rays).
-        names: of the kernels.
+        names: names of the kernels.
         packed: their argument structure.
-        files: in order.
+        files: the source files, in order.
     """
 
     macro: str
@@ -102,11 +102,11 @@ class Variant(NamedTuple):
     """A unit of compilation.
 
     Args:
-        source: of the kernels.
+        source: source of the kernels.
         real: the type of arithmetic.
         stored: the stored type, if different.
         together: volumes that share a ray's index work.
-        method: of rays.
+        method: method of rays.
     """
 
     source: Source

@@ -26,7 +26,7 @@ class Dual(NamedTuple):
     Args:
         values: p [3 n d h w].
         last: the previous values q, overwritten by a step; p itself for zero momentum.
-        momentum: without unit.
+        momentum: momentum, without a unit.
         rates: step length / voxel size along (z, y, x).
         one: 1 as the fields' type of number.
     """

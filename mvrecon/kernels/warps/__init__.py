@@ -30,7 +30,7 @@ def warp_reference(
     behind a source; plain torch, with derivatives of any order.
     Args:
         volumes: values on the source lattices.
-        maps: from `geometry.lattice`, float64.
+        maps: maps as `geometry.lattice` gives them, float64.
         shape: samples (d, h, w) of the output.
     """
     points = normalised_places(maps, volumes.shape[3:], shape).to(volumes.dtype)  # [s k d h w 3]
@@ -69,7 +69,7 @@ def warp(
 
     Args:
         volumes: values on s lattices; batch and channels share the computation of positions.
-        maps: from `geometry.lattice.lattice_maps`, float64.
+        maps: maps as `geometry.lattice.lattice_maps` gives them, float64.
         shape: samples (d, h, w) of the output.
         backend: "cpu" or "cuda" (compiled), "reference" (torch, any device), or "auto": compiled if
             available on the tensors' device.

@@ -25,9 +25,9 @@ class Blur(LinearOperator):
     """Gaussian blur along the axes of a tensor, symmetric, with zero padding.
 
     Args:
-        shape: of a volume (d, h, w), or of views (m, v, u).
+        shape: shape of a volume (d, h, w), or of views (m, v, u).
         sigmas: standard deviation along each axis, in voxels or pixels; 0: none.
-        device: where the operator computes.
+        device: device on which the operator computes.
     """
 
     def __init__(
@@ -61,9 +61,9 @@ class RootRamp(LinearOperator):
     """The square root of the windowed ramp filter along the rows of views, symmetric.
 
     Args:
-        shape: of the views (m, v, u).
+        shape: shape of the views (m, v, u).
         cutoff: fraction of the pixels' Nyquist frequency.
-        device: where it computes.
+        device: device on which the operator computes.
     """
 
     def __init__(self, shape: Sequence[int], cutoff: float, device: torch.device):
@@ -181,10 +181,10 @@ def alignment(
     Args:
         views: measured.
         expected: A x, in the same unit.
-        weight: of pixels, at least 0; by default 1.
+        weight: weight of each pixel, at least 0; by default 1.
         start: initial alignment; by default of error-free cameras.
         steps: Gauss-Newton steps.
-        prior: of the errors.
+        prior: standard deviations of the expected errors.
 
     Raises:
         ValueError: views of different shapes, or no step.
@@ -215,8 +215,8 @@ class _ViewFit(NamedTuple):
 
     Args:
         columns: derivatives by either shift, per pixel, and by the gain.
-        weight: of pixels.
-        precision: of the prior, 1 / variance.
+        weight: weight of each pixel.
+        precision: precision of the prior, 1 / variance.
     """
 
     columns: Float[Tensor, "b m n 3"]
@@ -285,7 +285,7 @@ def least_deviations(
     """Subtract the combination of modes that leaves the least sum of lengths; in the values' unit.
 
     Args:
-        values: of each camera.
+        values: values of each camera.
         modes: common to all cameras.
         floor: lengths below count as zero.
     """

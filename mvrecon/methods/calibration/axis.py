@@ -75,7 +75,7 @@ def refined_axis(
 
     Args:
         operator_of: the operator of a rig on a grid.
-        cameras: on a circle; their rows run across its axis.
+        cameras: a rig on a circle, with rows across its axis.
         views: measured integrals.
         grid: its box contains the object.
         most_px: greatest shift in pixels.

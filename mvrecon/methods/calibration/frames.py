@@ -31,10 +31,12 @@ class FrameShifts(NamedTuple):
     """Shifts of the object in each frame relative to the first.
 
     Args:
-        shift_mm: along x, y and z of the world; zeros for the first frame.
+        shift_mm: shift of each frame along x, y and z of the world, in mm; zeros for the first
+            frame.
         sigma_mm: their standard deviation by the Poisson noise, as if the activity were known;
             the weights W make it up to a third larger.
-        rounds: that were computed; `settled` if the last one moved nothing any more.
+        rounds: number of rounds that were computed; `settled` if the last one moved nothing any
+            more.
     """
 
     shift_mm: Float[Tensor, "g 3"]
@@ -67,12 +69,12 @@ def frame_shifts(
     Args:
         operator_of: shifts in mm -> the operator of all frames of an object that is shifted so,
             such as `Stacked` of the cameras `rig.moved(torch.eye(3), -shift)` of each.
-        grid: of the volume.
-        counts: of all frames, one after the other.
+        grid: grid of the volume.
+        counts: counts of all frames, one after the other.
         views: number of the views of each frame.
         background: expected counts of other origin.
-        iterations, subsets: of OSEM in each round.
-        rounds: at most.
+        iterations, subsets: number of OSEM's iterations in each round, and of its subsets.
+        rounds: maximum number of rounds.
 
     Warns:
         UserWarning: parts of the activity move unlike the rest, as a heart in a body at rest: the

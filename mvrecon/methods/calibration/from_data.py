@@ -41,7 +41,8 @@ class Kind(NamedTuple):
     """A parameter of a view.
 
     Args:
-        field, column: of `Misalignment`; None: the logarithm of the view's gain.
+        field, column: place of the parameter in `Misalignment`; None: the logarithm of the view's
+            gain.
         longest: largest change in a round, in pixels, degrees or as a logarithm.
     """
 
@@ -69,7 +70,7 @@ class Unknowns(NamedTuple):
 
     Args:
         kinds: names of the parameters of a view.
-        basis: of the free values; its columns have unit length.
+        basis: basis of the free values; its columns have unit length.
     """
 
     kinds: tuple[str, ...]
@@ -259,7 +260,8 @@ class Round(NamedTuple):
     """A round of the fit, as passed to a monitor.
 
     Args:
-        number: from 1, and again from 1 after undetermined parameters are fixed.
+        number: number of the round, from 1, and again from 1 after undetermined parameters are
+            fixed.
         residual: final |S y - A x| / |S y| of the blurred views.
     """
 
@@ -272,14 +274,15 @@ class Estimate(NamedTuple):
 
     Args:
         cameras: the rig.
-        misalignment: of each view relative to the nominal rig, in pixels and degrees.
+        misalignment: misalignment of each view relative to the nominal rig, in pixels and degrees.
         gains: factor of each view's integrals, their geometric mean 1; to be divided by.
         residual: |S y - A x| / |S y| of the blurred views, for the nominal rig and after each
             round.
         kept: names out of `free`, or of `KINDS` where it is a part of one, that stayed nominal.
         left_out: |S y - A x| / |S y| of held-out views, for the nominal and the fitted rig.
         settled: whether the fit converged before the last round.
-        uncertainty: of each kind of parameter that was fitted, out of `KINDS`, in its unit.
+        uncertainty: uncertainty of each kind of parameter that was fitted, out of `KINDS`, in its
+            unit.
     """
 
     cameras: Cameras
@@ -374,7 +377,7 @@ def calibrated(
             view: "shifts" (u and v, pixels; up to a motion of the object, the one by which most
             views have none), "gains" (factors). On a circle an offset_v is nearly a
             shift of the object, a slant nearly a stretch.
-        iterations: of conjugate gradients in each round.
+        iterations: number of conjugate-gradient iterations per round.
         rounds: maximum number of Gauss-Newton steps.
         monitor: called after each round.
 

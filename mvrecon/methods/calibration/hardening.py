@@ -41,7 +41,7 @@ class Linearisation(NamedTuple):
 
     Args:
         coefficients: c1 = 1, c2, ..., without a unit.
-        value: of the object in the corrected volume, in 1/mm.
+        value: value of the object in the corrected volume, in 1/mm.
         residual: root mean square of value L - sum c_k p^k over the fitted rays, relative to that
             of value L.
     """
@@ -122,10 +122,10 @@ def _check(
 
     Args:
         fit: the polynomial.
-        off: of the polynomial from the lengths, in mm.
+        off: deviation of the polynomial from the lengths, in mm.
         used: fitted rays.
         most: greatest line integral of these.
-        norm: of their lengths.
+        norm: norm of the lengths of these rays, in mm.
     """
     places = torch.linspace(0, most, 257, dtype=torch.float64)
     slope = sum(k * c * places ** (k - 1) for k, c in enumerate(fit.coefficients, start=1))

@@ -27,8 +27,8 @@ def helix(
 
     Args:
         count: number of balls, at least six.
-        radius_mm, height_mm: of the helix, its middle at the origin.
-        turns: of the helix; not whole, so that no ball is above another.
+        radius_mm, height_mm: radius and height of the helix in mm, its middle at the origin.
+        turns: number of turns of the helix; not whole, so that no ball is above another.
 
     Raises:
         ValueError: fewer than six balls.
@@ -54,7 +54,7 @@ def centroids(
     Args:
         views: integrals in which markers are bright.
         guesses: expected positions, as the nominal rig projects them.
-        radius_px: of the disc; must cover the marker and the error of the guess.
+        radius_px: radius of the disc, in pixels; must cover the marker and the error of the guess.
 
     Raises:
         ValueError: shapes that do not agree, or a radius below two pixels.

@@ -66,7 +66,7 @@ class CorrectedViews(NamedTuple):
     """Aligned views.
 
     Args:
-        views: in the unit of the measured ones.
+        views: aligned views, in the unit of the measured ones.
         alignment: estimated errors of the cameras.
     """
 
@@ -91,8 +91,9 @@ def self_aligned(
 
     Args:
         A: the operator of the nominal cameras; its grid must hold the whole object.
-        alternations: of reconstruction and alignment.
-        iterations: of SIRT with momentum in each but the first, from the previous volume.
+        alternations: number of alternations of reconstruction and alignment.
+        iterations: number of iterations of SIRT with momentum in each but the first, from the
+            previous volume.
 
     Warns:
         UserWarning: truncated views are not aligned (not on a GPU).
@@ -206,7 +207,8 @@ class Agreement(NamedTuple):
 
     Args:
         lost: views that the others do not predict: empty, overexposed, or noise.
-        gain: of each view relative to the others', 1 unless it makes the views more consistent.
+        gain: gain of each view relative to the others', 1 unless it makes the views more
+            consistent.
     """
 
     lost: Bool[Tensor, "b m"]
@@ -228,7 +230,7 @@ def agreement(
     Args:
         A: the operator of the nominal cameras.
         views: measured.
-        weights: of `sirt_weights`.
+        weights: weights as `sirt_weights` returns them.
     """
     blank = ~views.flatten(3).any(dim=3)[:, 0]
     smooth = blurred(views, BLUR_SIGMA_PX)
@@ -364,7 +366,7 @@ class Aligned(nn.Module):
 
     Args:
         method: name and options of the method.
-        alternations, iterations: as `self_aligned`.
+        alternations, iterations: as in `self_aligned`.
 
     Raises:
         LookupError: an unknown name.

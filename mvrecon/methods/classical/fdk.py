@@ -135,8 +135,8 @@ def pixel_weights(
 
     Args:
         rig: cameras of the views.
-        scan: of these views, on the cameras' device.
-        dtype: of the computation over pixels; geometry is float64.
+        scan: weights of these views' rays, on the cameras' device.
+        dtype: type of the computation over pixels; geometry is float64.
     """
     device, tangents, rows = rig.source.device, scan.orbit.tangents, unit(rig.u)
     v, u = (torch.arange(n, dtype=dtype, device=device) for n in rig.shape)
@@ -183,14 +183,14 @@ class FilterPlan:
     """Quantities of a rig that are computed before any view is filtered.
 
     Args:
-        rig: for weights and filter.
-        scan: of this rig.
-        response: of the filter.
-        longer: of the filter of rows that are continued by `beyond` columns on each side; None:
-            none are.
+        rig: cameras for weights and filter.
+        scan: weights of this rig's rays.
+        response: frequency response of the filter.
+        longer: frequency response of the filter of rows that are continued by `beyond` columns on
+            each side; None: none are.
         beyond: these columns.
-        images: of all voxels in the filtered views.
-        pixels: of a filtered view.
+        images: images of all voxels in the filtered views.
+        pixels: number of pixels of a filtered view.
         beyond_rows: the voxels that rows of views do not reach, in words; None: few.
     """
 
@@ -375,7 +375,7 @@ def fdk_streamed(
         read: read(first, last) returns the views first to last - 1 as an array [m v u].
         cameras: all cameras.
         grid: the voxels.
-        filter, cutoff, max_missing, weights_from, extrapolate: as `fdk`.
+        filter, cutoff, max_missing, weights_from, extrapolate: as in `fdk`.
 
     Returns:
         The volume on the grid, as `fdk` of all views at once.
@@ -470,7 +470,7 @@ def fbp(
     Args:
         A: the operator, whose grid and cameras are used.
         views: line integrals.
-        filter, cutoff, max_missing, extrapolate: as `fdk`.
+        filter, cutoff, max_missing, extrapolate: as in `fdk`.
 
     Returns:
         The volume on the operator's grid.

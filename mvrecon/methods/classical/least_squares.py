@@ -37,8 +37,8 @@ def conjugate_gradients(
 
     Args:
         problem: operator, views, start.
-        tolerance: of the gradient relative to |A^T W y|, and without a penalty of the residual
-            relative to |y|.
+        tolerance: stop a sample when its gradient relative to |A^T W y|, and without a penalty its
+            residual relative to |y|, is this small.
         penalty: N x.
         weights: W of the views; None: one.
         pull: g; None: zero.
@@ -172,8 +172,8 @@ def tikhonov(
         A: the operator.
         views: measured integrals.
         iterations: maximum number of iterations.
-        weight: of the gradient, in mm: about the length over which noise is smoothed. Of the
-            identity: without unit.
+        weight: weight of the gradient, in mm: about the length over which noise is smoothed. That
+            of the identity has no unit.
         penalty: D, the "gradient" or the "identity".
         tolerance: stop a sample when the objective's gradient relative to that at x = 0 is this
             small.

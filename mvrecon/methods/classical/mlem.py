@@ -133,7 +133,7 @@ def osem(
     Not differentiable, as `mlem`.
 
     Args:
-        A, counts, iterations, background, skip_zero_bins, common: as for `mlem`.
+        A, counts, iterations, background, skip_zero_bins, common: as in `mlem`.
         subsets: number of subsets of the cameras; None: the square root of the number of cameras.
 
     Returns:

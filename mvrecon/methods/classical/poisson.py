@@ -36,7 +36,8 @@ class PoissonLikelihood:
         background: expected counts r of other origin, one number or views that broadcast to the
             counts.
         views: indices of the views to use; all by default.
-        skip_zero_bins: if False, compute all bins of these views.
+        skip_zero_bins: skip the rays without counts in the whole batch; False: compute all of these
+            views.
 
     Raises:
         ValueError: a wrong rank, size or device; an empty batch; negative or non-finite counts or

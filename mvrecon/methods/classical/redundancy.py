@@ -60,8 +60,8 @@ class RedundancyWeights:
 
     Args:
         orbit: circle, or rotation of parallel beams.
-        weights: of each view in radians, at equal steps of the fan coordinate from -limit to limit;
-            one column if they are the same for all rays of a view.
+        weights: weights of each view in radians, at equal steps of the fan coordinate from -limit
+            to limit; one column if they are the same for all rays of a view.
         limit: greatest fan coordinate of `weights`, in radians; in mm for parallel beams.
         columns: empty columns before and behind the rows, as the ramp's response extends to lines
             that only other views measure.
@@ -203,7 +203,7 @@ class _Branches:
 
     Args:
         q: fan coordinates, symmetric about zero.
-        share: of the branch in each line.
+        share: share of the branch in each line.
         edge: distance of each view's lines from the edges of its panel.
         level: the same of the lines that its neighbours measure, too.
         measured: whether views of this branch or of its conjugate measure the line, a gap of a few
@@ -292,7 +292,7 @@ def _distributed(
     across an angle from which on views have other panels.
 
     Args:
-        cells: to be given, in radians.
+        cells: angles to be distributed, in radians.
         edge: distance of each view's lines from the edges of its panel.
         level: the greatest distance that counts in its cell.
     """
@@ -429,11 +429,11 @@ class _Missing:
     """The lines through a grid's inscribed cylinder that no ray measures.
 
     Args:
-        share: of all lines through it.
+        share: their share of all lines through it.
         worst: greatest share of the lines at one distance from the axis.
-        where: in words.
+        where: where they are, in words.
         hole: whether no line at some distance from the axis is measured, but lines farther off are.
-        radius: of the cylinder in mm.
+        radius: radius of the cylinder, in mm.
     """
 
     share: float
@@ -461,8 +461,8 @@ class _Missing:
 
         Args:
             measured: whether each of them is.
-            radius: of the cylinder in mm.
-            offset: from the isocentre to the cylinder, in mm.
+            radius: radius of the cylinder, in mm.
+            offset: vector from the isocentre to the cylinder, in mm.
         """
         count = branches.share.shape[1]
         q = branches.q[FAN_DISTANCES:]

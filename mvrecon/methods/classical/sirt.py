@@ -203,7 +203,7 @@ def sirt(
         iterations: number of iterations.
         nonnegative: clip each iterate at zero.
         momentum: use Nesterov's momentum.
-        weights: of `sirt_weights`, if already computed.
+        weights: weights as `sirt_weights` returns them, if already computed.
         common: start, support, monitor: see `Common`.
 
     Returns:
@@ -355,7 +355,7 @@ def os_sart(
     Args:
         A: the operator.
         views: measured integrals.
-        iterations: over all views.
+        iterations: number of passes over all views.
         subsets: number of subsets, visited in an order in which neighbours are far apart; None: the
             square root of the number of views. 1 is SIRT, one per view is SART.
         relaxation: l, above 0 and below 2.

@@ -30,7 +30,7 @@ class Iterate(NamedTuple):
         residual: y - A x_n, in the unit of the views.
         gap: upper bound of the objective's excess over its minimum, relative to the objective; None
             where not computed.
-        objective: of each sample; None for methods that do not compute it.
+        objective: value of the objective for each sample; None for methods that do not compute it.
     """
 
     number: int
@@ -157,8 +157,8 @@ class InverseProblem:
         Args:
             A, views, iterations: the method's arguments.
             options: those that all methods share.
-            background: of counts, whose values `PoissonLikelihood` checks; None: the views are line
-                integrals.
+            background: expected background of counts, whose values `PoissonLikelihood` checks;
+                None: the views are line integrals.
 
         Raises:
             ValueError: views or a start of another shape or device than the operator's, or with

@@ -159,7 +159,7 @@ class ValidationRun(NamedTuple):
     """A run without the validation views.
 
     Args:
-        weight: of the penalty; None for a method without.
+        weight: weight of the penalty; None for a method without.
         errors: relative error of the validation views, |y - A x_n| / |y|, for n = 1, 2, ... of each
             sample.
     """
@@ -172,7 +172,7 @@ class Choice(NamedTuple):
     """Result of cross-validation over views.
 
     Args:
-        volume: of all views, in the unit of the volume.
+        volume: volume of all views, in the unit of the volume.
         iterations: best number, for each sample.
         weights: best weight, for each sample; None for a method without.
         trials: the runs that were compared.
@@ -208,8 +208,8 @@ def held_out(
         weights: values of the method's option `weight` to compare; None: its default.
         every: one view in so many is held out.
         patience: stop a trial after so many iterations without improvement in any sample.
-        options: of the method; `iterations` is the maximum, and `monitor` gets the iterates of all
-            runs.
+        options: options of the method; `iterations` is the maximum, and `monitor` gets the iterates
+            of all runs.
 
     Returns:
         The volume of all views, with the iterations and weights that were chosen and all trials.

@@ -68,7 +68,7 @@ def tv_proximal(
         shrinkage: strength, voxel size and sign.
         dual: the initial field, vectors of length at most 1; overwritten.
         iterations: gradient steps on the dual.
-        rate: of `dual_rate`, if already computed.
+        rate: step length on the dual, `dual_rate`, if already computed.
     """
     rate = dual_rate(shrinkage) if rate is None else rate
     if rate == 0:
@@ -109,7 +109,7 @@ def power_norm(
     Args:
         A: the operator.
         iterations: products with A^T A.
-        dtype: of the computation.
+        dtype: type of the computation.
     """
     random = torch.Generator().manual_seed(0)
     x = torch.rand(1, 1, *A.domain_shape, generator=random, dtype=dtype).to(A.device)
@@ -150,8 +150,8 @@ def fista_tv(
         A: the operator.
         views: measured integrals.
         iterations: number of iterations.
-        weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
-            in 1/mm, densities of about one need 1e-4 to 1e-2.
+        weight: weight of the total variation, in (unit of the volume) mm; the default is for
+            attenuation in 1/mm, densities of about one need 1e-4 to 1e-2.
         inner: gradient steps of each proximal map, which begin at its last dual field. With 5 the
             objective stays up to 0.5 % above the minimum, with 10 within 0.1 %.
         preconditioned: use SIRT's step lengths, the inverse column sums; else one length for all
@@ -226,7 +226,7 @@ class PenalisedFit(NamedTuple):
 
     Args:
         fit: the data term.
-        weight: of the total variation, in (unit of the volume) mm.
+        weight: weight of the total variation, in (unit of the volume) mm.
         steps: voxel size along (z, y, x), in mm.
         nonnegative: constrain the volume to non-negative values.
         support: 1 for voxels that may differ from zero; None: everywhere.
@@ -254,7 +254,7 @@ class PenalisedFit(NamedTuple):
         Args:
             volume: x.
             residual: y - A x.
-            bound: of the method's dual steps.
+            bound: lower bound by the method's dual steps.
         """
         row, level = self.fit.weights.row, self.fit.level
         misfit = torch.where(row > 0, residual - bound.views / torch.where(row > 0, row, 1), 0)
@@ -323,8 +323,8 @@ def pdhg_tv(
         A: the operator.
         views: measured integrals.
         iterations: maximum number of iterations.
-        weight: of the total variation, in (unit of the volume) mm; the default is for attenuation
-            in 1/mm, densities of about one need 1e-4 to 1e-2.
+        weight: weight of the total variation, in (unit of the volume) mm; the default is for
+            attenuation in 1/mm, densities of about one need 1e-4 to 1e-2.
         balance: ratio of dual to primal steps; affects the speed only.
         nonnegative: constrain the volume to non-negative values.
         gap: stop a sample at this duality gap relative to the objective, computed every 10

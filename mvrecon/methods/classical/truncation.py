@@ -57,8 +57,8 @@ def edges_of(
 
     Args:
         views: line integrals.
-        weights: of their pixels, which fall to zero where another view measures the same lines, as
-            at one side of a half fan; None: all alike.
+        weights: weights of the views' pixels, which fall to zero where another view measures the
+            same lines, as at one side of a half fan; None: all alike.
     """
     blocks = min(ROW_BLOCKS, views.shape[-2])
     means = torch.stack([part.mean(dim=-2) for part in views.tensor_split(blocks, dim=-2)], dim=-1)
@@ -124,7 +124,8 @@ def continuation(
 
     Args:
         views: line integrals.
-        weights: of the views, which fall to zero where others measure the lines beyond.
+        weights: weights of the views' pixels, which fall to zero where others measure the lines
+            beyond.
         count: k, of columns on each side.
     """
     before = _behind(views.flip(-1), weights.flip(-1), count)

@@ -40,7 +40,7 @@ class UNet3d(PlainUNet):
     Args:
         inputs, outputs: channels.
         widths: channels of each scale, the finest first.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
     """
 
     def __init__(
@@ -117,9 +117,10 @@ class VolumeUNet(nn.Module):
         network: name and options of another network in its place.
         start: iterations of SIRT with momentum, or name and options of a classical method.
         consistency: number of data-consistency steps at the end, or options of `Consistency`.
-        support: from the views: the visual "hull", its "box", "auto" or "none".
-        noise: of the views, for the support, as in `support_from_views`.
-        precision: of the convolutions.
+        support: voxels that the views do not show to be empty: the visual "hull", its "box", "auto"
+            or "none".
+        noise: noise of the views, for the support, as in `support_from_views`.
+        precision: precision of the convolutions.
 
     Raises:
         ValueError: an unknown support.
@@ -175,7 +176,7 @@ class MeanFusion(nn.Module):
         n_cameras: one network for each of so many cameras; None: one for all.
         start: iterations of SIRT with momentum, or name and options of a classical method.
         consistency: number of data-consistency steps at the end, or options of `Consistency`.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
     """
 
     def __init__(
@@ -224,7 +225,7 @@ class GeometryFree(nn.Module):
         n_cameras: number of views.
         widths: channels of each scale of the U-Net, the finest first.
         network: name and options of another network in its place.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
     """
 
     def __init__(

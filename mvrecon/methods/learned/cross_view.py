@@ -85,10 +85,11 @@ class CrossView(nn.Module):
             volume network; None: 12 for line integrals, none for counts.
         consistency: number of data-consistency steps at the end, or options of `Consistency`; for
             counts `{steps: 3, noise: poisson, rule: em}`.
-        support: from the views: the visual "hull", its "box", "auto" or "none".
-        noise: of the views, for the support, as in `support_from_views`.
+        support: voxels that the views do not show to be empty: the visual "hull", its "box", "auto"
+            or "none".
+        noise: noise of the views, for the support, as in `support_from_views`.
         crop: confine the volume network to the box around the support.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
 
     Raises:
         ValueError: an unknown choice, a network without scales, unshared networks without
@@ -352,7 +353,7 @@ class PerViewEstimates(nn.Module):
         features have no channels.
 
         Args:
-            frames: of the cameras.
+            frames: depth frames of the cameras.
             g: the operator and SIRT's weights.
             y, r: views and residual views.
             x: the volume.
@@ -410,7 +411,7 @@ class RayUNet(PlainUNet):
 
     Args:
         widths: channels of each scale, the finest first.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
     """
 
     def __init__(self, widths: Sequence[int], precision: Precision = "auto"):

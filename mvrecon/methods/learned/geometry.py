@@ -93,10 +93,11 @@ def geometry_of(
     """Return the geometry of an operator, in the dtype of the views, with each sample's support.
 
     Args:
-        views: as `validated` returns them.
+        views: the views as `validated` returns them.
         A: the operator.
-        support: from the views: the visual "hull", its "box", "auto" or "none".
-        noise: of the views, as in `support_from_views`.
+        support: voxels that the views do not show to be empty: the visual "hull", its "box", "auto"
+            or "none".
+        noise: noise of the views, as in `support_from_views`.
     """
     if support == "none":
         return Geometry.of(A, views.dtype)

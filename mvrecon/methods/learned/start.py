@@ -56,9 +56,9 @@ class CaseCache:
         Args:
             make: computes results [n ...] of n samples from their indices.
             A: the operator.
-            options: of the computation.
+            options: options of the computation.
             views: measured.
-            support: of each sample; None: all voxels.
+            support: support of each sample; None: all voxels.
         """
         parts: Sequence[Tensor | None] = [None] * len(views) if support is None else list(support)
         names = [
@@ -319,7 +319,7 @@ def em_change(
     differentiable. Zero for voxels that no ray passes.
 
     Args:
-        geometry: with C the inverse column sums of w A.
+        geometry: geometry whose C is the inverse column sums of w A.
         volume: x, non-negative.
         measured: y, non-negative.
         expected: A x.
@@ -363,7 +363,7 @@ def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]
     A, in the unit of the volume by that of the views.
 
     Args:
-        geometry: with R and C of SIRT.
+        geometry: geometry with R and C of SIRT.
         expected: counts, clamped to at least a hundredth of their mean over the rays of the mask. A
             sample that expects none has zero weights.
     """

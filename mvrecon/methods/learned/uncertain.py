@@ -32,7 +32,7 @@ class Uncertain(nn.Module):
 
     Args:
         method: name and options of the method.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
     """
 
     def __init__(self, method: MethodPart, precision: Precision = "auto"):

@@ -38,7 +38,7 @@ class PlainUNet(nn.Module):
         outputs: channels out.
         widths: channels of each scale, the finest first.
         zero: number of first outputs that start at exactly zero, for corrections.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
     """
 
     def __init__(
@@ -210,8 +210,8 @@ def to_cells(x: Shaped[Tensor, "n c *d"], edge: int) -> Shaped[Tensor, "n k *e"]
     """Rearrange cells of `edge` pixels along each axis into channels (space to depth).
 
     Args:
-        x: of sizes that `edge` divides.
-        edge: of a cell, in pixels or voxels.
+        x: values on axes whose sizes `edge` divides.
+        edge: edge of a cell, in pixels or voxels.
     """
     if edge == 1:
         return x

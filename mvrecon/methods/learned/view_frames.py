@@ -182,7 +182,7 @@ class ViewFrames:
     A frustum holds attenuated density, so its sums along the rays are the camera's view.
 
     Args:
-        frusta: over cells of voxels, with cells of pixels as rows and columns.
+        frusta: frusta over cells of voxels, with cells of pixels as rows and columns.
         scale: halvings of the grid; cells of 2^scale voxels along each axis.
         binning: pixels of a cell along each axis.
         transmission: share of each bin's emission that reaches the detector; None: no attenuation.
@@ -339,7 +339,7 @@ def transmission(frusta: Frusta, mu: Float[Tensor, "b 1 e i x"]) -> Float[Tensor
     of greater index.
 
     Args:
-        frusta: of the rig.
+        frusta: frusta of the rig.
         mu: linear attenuation on their grid, in 1/mm.
     """
     inside = frusta.to_frusta(mu[:, None].to(frusta.slant)) * frusta.occupied * frusta.step

@@ -36,7 +36,7 @@ class UNetWeighting(PlainUNet):
     Args:
         inputs: channels of a camera.
         widths: channels of each scale, the finest first.
-        precision: of the convolutions.
+        precision: precision of the convolutions.
 
     Raises:
         ValueError: no scales.

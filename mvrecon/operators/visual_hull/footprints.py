@@ -71,7 +71,7 @@ def footprints(
 
     Args:
         cameras: the rig.
-        grid: of the bricks' voxels.
+        grid: grid of the bricks' voxels.
         bricks: N of them; all cameras' corners are held at once, 500 bytes per brick and camera.
         reach: voxels by which interpolation extends a value beyond the faces of its voxel: 0.5 for
             joseph and trilinear (a voxel from its centre), 0 for siddon.

@@ -46,7 +46,7 @@ class ViewNoise(TypedDict, total=False):
     """Noise of views, for `support_from_views`.
 
     Args:
-        photons: of an unattenuated pixel; none: exact views.
+        photons: number of photons of an unattenuated pixel; none: exact views.
         sigmas: standard deviations of the noise, see `noise_threshold`.
         witnesses: views that must agree that a voxel is empty.
     """
@@ -75,7 +75,7 @@ def support_from_views(
         cameras, grid: the rig and the voxels.
         kind: "none": the whole grid; "hull": the visual hull; "box": its box; "auto": the hull if
             its box holds less than 0.7 of the grid, else the whole grid.
-        noise: of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of
+        noise: noise of the views: none (exact); {photons: I0} of X-rays, with `sigmas` of
             `noise_threshold`. Both also support `witnesses`, the number of views that must agree:
             by default `thin_witnesses`, with photons at least 3.
         brick: edge in voxels; by default `brick_edge`.

@@ -53,7 +53,7 @@ def content(
 
     Args:
         volume: values in any unit.
-        grid: of the volume.
+        grid: grid of the volume.
         cameras: restrict it to the voxels in the field of view of the most views, such as the
             heart at which pinholes aim, without the liver. None: all voxels.
     """
@@ -77,7 +77,7 @@ def planes(
 
     Args:
         volume: the values.
-        grid: of the volume; its voxels may be finer or coarser.
+        grid: grid of the volume; its voxels may be finer or coarser.
         centre: the point in world mm, rounded to a voxel; None: the grid's centre.
     """
     at = grid.to_index(grid.centre if centre is None else centre) + 0.5

@@ -50,11 +50,11 @@ def page(
 
     Args:
         volume: values in any unit.
-        grid: of the volume.
+        grid: grid of the volume.
         cameras: the rig; none by default.
         window: values of black and white; by default the 1st and the 99.9th percentile.
         first: initial picture, one of `MAX_VOXELS`.
-        title: of the page.
+        title: title of the page.
 
     Raises:
         ImportError: k3d is not installed.

@@ -253,11 +253,11 @@ class CaseSheets(NamedTuple):
     """Title and scales of a case's sheets.
 
     Args:
-        name: of the case.
-        grid: of its volumes, which may be coarser in the same box.
+        name: name of the case.
+        grid: grid of its volumes, which may be coarser in the same box.
         data_range: upper end of the volumes' values.
-        unit: of the volumes.
-        unit_of_views: of the views.
+        unit: unit of the volumes.
+        unit_of_views: unit of the views.
         centre: point in world mm through which its planes pass; None: the grid's centre.
     """
 
@@ -316,7 +316,7 @@ def planes(
     Args:
         case: its grid and range.
         truth: the true values.
-        volumes: by name; further lines of a name, such as figures, are printed below it.
+        volumes: volumes by name; further lines of a name, such as figures, are printed below it.
         marked: the truth with a support's outline, drawn instead.
     """
     case = case.about(truth)
@@ -392,11 +392,11 @@ def save_planes(
     orientation. Black is 0, or the 0.5th percentile if that is less; white the 99.5th.
 
     Args:
-        path: of the picture, such as "planes.png".
+        path: path of the picture, such as "planes.png".
         volume: the values.
-        grid: of the volume.
-        unit: of the values: "1/mm" and "HU" are an attenuation, "activity" an activity.
-        title: above the planes.
+        grid: grid of the volume.
+        unit: unit of the values: "1/mm" and "HU" are an attenuation, "activity" an activity.
+        title: text above the planes.
 
     Examples:
         >>> grid = mv.Grid.centred(16, spacing=2.0)
@@ -565,7 +565,7 @@ def alignments(
     Args:
         shift_px: estimated, along columns (to the right) and rows (downwards).
         gain: estimated.
-        true_shift_px: if known.
+        true_shift_px: true shifts, along columns and rows, in pixels; None: unknown.
     """
     truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
     tiles = [

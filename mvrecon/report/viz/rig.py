@@ -163,7 +163,7 @@ class Mesh(NamedTuple):
 
     Args:
         vertices: world mm.
-        colours: of the vertices, red, green and blue up to 255.
+        colours: colour of each vertex: red, green and blue up to 255.
         faces: indices of three vertices each.
     """
 

@@ -53,7 +53,7 @@ class BreastSlices(Scene):
         specks: minimum and maximum number per slice.
         fine: factor by which the grid of the projected object is finer; the truth is its block
             mean.
-        method: of the projector that makes the views.
+        method: method of the projector that makes the views.
 
     Raises:
         ValueError: numbers out of range.
@@ -125,7 +125,7 @@ class Specks(NamedTuple):
 
     Args:
         centres: (x, y).
-        radii: of the discs.
+        radii: radius of each disc.
         brightness: 0 for fibroglandular tissue, 1 for the brightest microcalcification.
     """
 
@@ -138,8 +138,8 @@ class Texture(NamedTuple):
     """A sum of waves with random phases.
 
     Args:
-        amplitude: of waves over (y, x), complex.
-        frequency: along y and along x, in radians per radius.
+        amplitude: amplitude of each wave over (y, x), complex.
+        frequency: frequency of each wave along y and along x, in radians per radius.
         axial: frequency along z of each wave, in radians per radius.
         threshold: texture values above it are fibroglandular tissue.
     """
@@ -214,10 +214,10 @@ def slice_values(
 
     Args:
         texture: defines the fibroglandular tissue.
-        specks: of this slice.
-        y: of the slice's rows, in radii of the breast.
-        x: of its columns.
-        z: of the slice.
+        specks: microcalcifications of this slice.
+        y: positions of the slice's rows, in radii of the breast.
+        x: positions of its columns, in radii of the breast.
+        z: position of the slice, in radii of the breast.
         edge: width of the tissues' boundaries, linear ramps, in radii; 0 for steps.
     """
     radius = torch.hypot(y[:, None], x)

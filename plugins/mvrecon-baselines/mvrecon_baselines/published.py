@@ -213,7 +213,7 @@ def valid_size(size: int, levels: int) -> int:
     """Output size along an axis in voxels, for convolutions without padding.
 
     Args:
-        size: of the input, in voxels.
+        size: size of the input, in voxels.
         levels: scales of a U-Net with two 3x3x3 convolutions per scale.
 
     Raises:

@@ -53,7 +53,7 @@ class RadonUNet(nn.Module):
         start: iterations of SIRT with momentum, or name and options of a classical method, for the
             initial volume.
         filter: window of the ramp, as in `fbp`.
-        precision: of the U-Net's convolutions.
+        precision: precision of the U-Net's convolutions.
 
     Raises:
         ValueError: an odd number of angles or fewer than 4, or no feature.

@@ -44,7 +44,7 @@ class FbpUNet(nn.Module):
     Process. 26, 2017).
 
     Args:
-        width, levels: of the network on slices, see `UNet2d`.
+        width, levels: width and levels of the network on slices, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
     """
 
@@ -96,7 +96,7 @@ class SinogramUNet(nn.Module):
 
     Args:
         factor: number of views per measured view.
-        width, levels: of the network, see `UNet2d`.
+        width, levels: width and levels of the network, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
 
     Raises:
@@ -148,7 +148,7 @@ class DualDomain(SinogramUNet):
 
     Args:
         factor: number of views per measured view.
-        width, levels: of each network, see `UNet2d`.
+        width, levels: width and levels of each network, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
 
     Raises:

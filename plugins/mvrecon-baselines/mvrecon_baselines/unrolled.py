@@ -30,7 +30,7 @@ class ItNet(nn.Module):
         iterations: number of iterations of network and step.
         memory: channels passed from one call of the network to the next.
         shared: use one network for all iterations instead of one each.
-        width, levels: of the network on slices, see `UNet2d`.
+        width, levels: width and levels of the network on slices, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
 
     Raises:

@@ -58,7 +58,7 @@ class Astra(Paired):
     in its slice.
 
     Args:
-        grid: where the voxels lie.
+        grid: voxels of the volume.
         cameras: the rig.
         method: "line" (Siddon), or for parallel beams "linear" (Joseph) or "strip" (the average
             over a column's width).

@@ -50,7 +50,7 @@ class Diffdrr(Traced):
     value depends on the other rays, by a few per cent if few samples remain for it.
 
     Args:
-        grid: where the voxels lie.
+        grid: voxels of the volume.
         cameras: the rig.
         method: "siddon" or "trilinear".
         samples: number of samples along a ray (trilinear), from the first entry to the last exit of

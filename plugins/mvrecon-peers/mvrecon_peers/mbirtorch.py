@@ -106,7 +106,7 @@ class Mbirtorch(Paired):
     about it whose detector rows lie in the central planes of slices (or outside the grid).
 
     Args:
-        grid: where the voxels lie.
+        grid: voxels of the volume.
         cameras: the rig.
         compile_mode: mbirtorch's option: "auto" compiles at the first call, and again for another
             number of threads, which takes minutes (if a compiler is installed); or "off".

@@ -21,7 +21,7 @@ class Nanodrr(Traced):
     every rig of mvrecon, including parallel ones.
 
     Args:
-        grid: where the voxels lie.
+        grid: voxels of the volume.
         cameras: the rig.
         samples: number of samples along a ray; by default the number of voxels along the grid's
             diagonal.

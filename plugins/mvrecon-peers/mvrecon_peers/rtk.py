@@ -92,7 +92,7 @@ class Rtk(Paired):
     parallel beams.
 
     Args:
-        grid: where the voxels lie.
+        grid: voxels of the volume.
         cameras: the rig.
 
     Raises:

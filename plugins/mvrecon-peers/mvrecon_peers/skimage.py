@@ -57,7 +57,7 @@ class Skimage(Paired):
     rows must lie in the central planes of slices (or outside the grid).
 
     Args:
-        grid: where the voxels lie.
+        grid: voxels of the volume.
         cameras: the rig.
 
     Raises:

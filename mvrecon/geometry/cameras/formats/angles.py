@@ -48,7 +48,7 @@ def read(
     towards v; about v; about u) and `height_mm` (source and detector along z).
 
     Args:
-        path: of the CSV.
+        path: path of the CSV.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
         sid_mm: mm from the source to the axis, if not a column.
         sdd_mm: mm from the source to the detector's centre, if not a column.

@@ -95,7 +95,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: boo
 
     Args:
         cameras: cone beams ("cone_vec") or parallel beams ("parallel3d_vec").
-        path: of the text.
+        path: path of the text file.
         world: axes of the file.
         flip_rows: v upwards; the rows of the views must be reversed for ASTRA.
 

@@ -125,7 +125,7 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
     that of `<file>:<column>`.
 
     Args:
-        path: of the file.
+        path: path of the file.
         small_arc: the angles are degrees although they look like radians.
 
     Raises:
@@ -145,9 +145,9 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, lis
     """Numbers, one for each view, as `angles_in` reads them, and the name of their column, if any.
 
     Args:
-        path: of the file.
+        path: path of the file.
         what: they are, in messages.
-        names: of a table's column.
+        names: pattern of the name of a table's column.
 
     Raises:
         FileNotFoundError: nothing is there.

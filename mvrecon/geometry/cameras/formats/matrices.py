@@ -23,8 +23,8 @@ def read(
     """Cone-beam rig in mm from 3x4 matrices P with P (X, 1) ~ (u, v, 1), u and v in pixels.
 
     Args:
-        path: of the text: twelve numbers per line, or three lines of four per view; # begins a
-            comment.
+        path: path of the text file: twelve numbers per line, or three lines of four per view; #
+            begins a comment.
         detector: options of `Detector`: pixels and pixel_mm, each (v, u); an offset is P's.
         first_pixel: coordinate of the first pixel's centre in P: 0, 0.5 (corners are integers), or
             1 (MATLAB).

@@ -145,7 +145,7 @@ def read(path: str | Path) -> Cameras:
     """Rig in mm from Nikon's .xtekct.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Convention: as the Core Imaging Library reads it (Jørgensen and others, Phil. Trans. R. Soc. A
     379, 2021): the object turns clockwise by AngularStep seen from above, from InitialAngle; the

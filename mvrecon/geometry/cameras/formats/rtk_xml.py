@@ -65,7 +65,7 @@ def read(
     """Rig in mm from RTK's geometry XML: cone beams, or parallel beams if SDD is zero.
 
     Args:
-        path: of the XML, version 3.
+        path: path of the XML file, version 3.
         detector: options of `Detector`: pixels and pixel_mm, each (v, u); offset_mm is 0 if the
             projections' image is centred about its origin; see `detector_of_image`, which
             `mvrecon-reconstruct` uses for views in MHA and NRRD.

@@ -50,7 +50,7 @@ def read(
     about u, roll about v) radians, `COR` mm; `mode` "cone" or "parallel".
 
     Args:
-        path: of the JSON.
+        path: path of the JSON file.
         world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
         flip_rows: must be true: TIGRE's first row is the lowest; the rows of the views must be
             reversed.

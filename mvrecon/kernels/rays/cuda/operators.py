@@ -42,12 +42,12 @@ class Call:
 
     Args:
         values: volumes [n d h w] or views [n m v u], in a type that the kernels read.
-        lines: of the rays.
+        lines: lines of the rays.
         window: valid range of a ray.
         occupancy: the non-zero part of the volume.
         detector: pixels (rows, columns).
-        method: of the rays.
-        source: of the kernels.
+        method: method of the rays.
+        source: source of the kernels.
         together: maximum number of volumes that share a ray's index work.
     """
 

@@ -169,7 +169,7 @@ def fields(
 
     Args:
         results: output.
-        grid, rig: of a cone beam.
+        grid, rig: grid and rig of a cone beam.
         x: volumes [b 1 d h w].
         views: views of that rig, [b 1 m v u], with zeros outside the object.
         device: device of the kernels.

@@ -26,7 +26,7 @@ def options_of(doc: str | None, settings: bool = False, **defaults: Any) -> Name
     """
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--device", default="cuda", help="or cpu, or dry: a stand-in for a GPU")
+    parser.add_argument("--device", default="cuda", help="cuda, cpu, or dry: a stand-in for a GPU")
     for name, value in defaults.items():
         kind: dict[str, Any] = {"type": type(value)}
         if isinstance(value, bool):
@@ -35,7 +35,9 @@ def options_of(doc: str | None, settings: bool = False, **defaults: Any) -> Name
             kind = {"nargs": "*", "type": type(value[0])}
         parser.add_argument(f"--{name}", default=value, help=f"default: {value}", **kind)
     if settings:
-        parser.add_argument("settings", nargs="*", help="of the experiment, as method.support=hull")
+        parser.add_argument(
+            "settings", nargs="*", help="settings of the experiment, such as method.support=hull"
+        )
     return parser.parse_args()
 
 

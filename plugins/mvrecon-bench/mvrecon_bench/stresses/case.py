@@ -43,7 +43,7 @@ class Case:
         kind: kind of the tested parts; one of `KINDS`.
         measure: runs the case on a subject and returns the number that must not exceed the
             tolerance. May raise `DoesNotApply`; any other exception is a failure.
-        tolerance: for all dtypes, or per dtype; 0 for exact equality.
+        tolerance: largest error that passes, for all dtypes or per dtype; 0 for exact equality.
         dtypes: supported dtypes; others are skipped.
     """
 

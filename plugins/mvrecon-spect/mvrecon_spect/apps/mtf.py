@@ -67,8 +67,8 @@ def measure(
         path: a file that `mvrecon.read_volume` reads.
         given: balls; without any and without planes, those that `balls` finds.
         planes: a point and the normal of each, (x, y, z, nx, ny, nz).
-        reach: of planes, see `plane_mtf`.
-        cone_degrees: of balls, see `ball_mtf`.
+        reach: mm from the point of a plane that are uniform, see `plane_mtf`.
+        cone_degrees: half-angle of the cones in balls, in degrees, see `ball_mtf`.
 
     Raises:
         ValueError: no ball is found, or see `ball_mtf` and `plane_mtf`.

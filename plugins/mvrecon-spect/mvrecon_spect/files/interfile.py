@@ -107,8 +107,8 @@ def read_header(path: str | Path, content: Content) -> Header:
     """Read an Interfile header, and check the keys that change values or places.
 
     Args:
-        path: of the header.
-        content: of the file, which determines its keys: `KEYS` and `CONTENT[content]`.
+        path: path of the header.
+        content: kind of the file, which determines its keys: `KEYS` and `CONTENT[content]`.
 
     Raises:
         FileNotFoundError: the file does not exist.
@@ -267,8 +267,8 @@ def check_repeated(
     """Check keys that repeat a number, where the header has them.
 
     Args:
-        header: of the file.
-        names: of the keys.
+        header: header of the file.
+        names: names of the keys.
         expected: their number.
         what: its origin, for the message.
         tolerance: relative.

@@ -132,7 +132,7 @@ def write_interfile_volume(path: str | Path, volume: Float[Tensor, "d h w"], gri
     Args:
         path: path of the header, ending in .hv.
         volume: finite values on the grid.
-        grid: with axes along x, y and z.
+        grid: a grid with axes along x, y and z.
 
     Raises:
         ValueError: a wrong file extension, a shape other than the grid's, values that are not

@@ -22,7 +22,7 @@ def dicom_views(path: Path, dataset: str | None = None) -> ProjectionStack:
     """Views in a DICOM file: `NmViews` of a gamma camera, or projections in the file's order.
 
     Args:
-        path: of the file.
+        path: path of the file.
         dataset: see `NmViews`.
 
     Raises:
@@ -43,7 +43,7 @@ class NmViews(ProjectionStack):
     which NM does not have. The duration of a gated frame, a part of each cycle, is unknown.
 
     Args:
-        path: of the file.
+        path: path of the file.
         dataset: the energy window and the frame in time, numbered from 1 in the order of
             `read_frames`: "window2", "frame3" or "window2/frame3"; None: the only ones.
 

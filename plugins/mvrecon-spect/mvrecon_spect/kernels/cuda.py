@@ -49,7 +49,7 @@ class Call:
         values: volumes [n d h w] or views [n m v u].
         rig: the record of each pinhole, see `reference.project`.
         shape, detector: voxels (d, h, w), and rows and columns.
-        transmission: from each voxel to each pinhole, or None.
+        transmission: share of photons that arrive, from each voxel to each pinhole, or None.
     """
 
     def __init__(

@@ -37,7 +37,7 @@ def add_up(mu, start, along, world, ends, step, sums):
             (0, 0).
         world: the same in mm.
         ends: first ray and distance of rays along u and v in pixels, first depth in mm.
-        step: of depth, in mm.
+        step: step of depth, in mm.
         sums: [slabs + 1, rows, columns], to be set.
     """
     slabs, rows, columns = sums.shape
@@ -103,7 +103,7 @@ def look_up(sums, to_pixels, length, ends, step, result):
     Args:
         sums, ends, step: see `add_up`.
         to_pixels: [3 4] from index (i, j, k, 1) to w (u, v, 1).
-        length: from hole to detector, in mm.
+        length: distance from hole to detector, in mm.
         result: [d h w], to be set.
     """
     slabs, rows, columns = sums.shape

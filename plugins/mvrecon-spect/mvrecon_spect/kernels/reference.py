@@ -77,7 +77,7 @@ def project(
         volume: emission per mm^3.
         rig: the record of each pinhole, see above.
         detector: rows and columns.
-        transmission: from each voxel to each pinhole; None: one.
+        transmission: share of photons that arrive, from each voxel to each pinhole; None: one.
     """
     rows, columns = detector
     flat = volume.flatten(1)

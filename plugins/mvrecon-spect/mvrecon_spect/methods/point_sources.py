@@ -52,10 +52,10 @@ def fit_point_sources(
     Args:
         views: counts of each source, without background.
         points: positions in mm.
-        cameras: to start from.
-        hole: to start from.
+        cameras: rig to start from.
+        hole: pinhole to start from.
         intrinsic_mm: FWHM to start from.
-        iterations: of L-BFGS, at most.
+        iterations: maximum number of iterations of L-BFGS.
 
     Raises:
         ValueError: views of another shape, counts that are negative or not finite, or a source
@@ -151,7 +151,7 @@ def image_widths(
         points: positions in mm.
         cameras: such as of `fit_point_sources`.
         hole: its sensitivity is that of efficiency one.
-        least_counts: of an image.
+        least_counts: least number of counts of an image.
         photons: emitted in the measurement, of each source; adds the `efficiency`.
 
     Raises:

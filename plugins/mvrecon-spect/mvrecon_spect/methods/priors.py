@@ -114,8 +114,8 @@ class Pairs(NamedTuple):
     """All pairs of voxels with the same offset.
 
     Args:
-        offset: from the first voxel to the second, along (z, y, x).
-        weight: of each pair.
+        offset: step from the first voxel to the second, along (z, y, x).
+        weight: weight of each pair.
     """
 
     offset: Sequence[int]

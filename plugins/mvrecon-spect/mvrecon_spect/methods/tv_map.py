@@ -42,8 +42,9 @@ def tv_map(
         A: the operator, in counts per unit of the volume.
         counts: measured.
         iterations: number of iterations, each over all counts.
-        weight: of the total variation, in mm; c is the mean sensitivity of the visible voxels, so
-            f(a y) = a f(y): longer measurements are not smoothed more. 1e-3 to 1 is usual.
+        weight: weight of the total variation, in mm; c is the mean sensitivity of the visible
+            voxels, so f(a y) = a f(y): longer measurements are not smoothed more. 1e-3 to 1 is
+            usual.
         balance: ratio of dual to primal steps; affects the speed only.
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
@@ -90,7 +91,7 @@ def _primal_dual(
     Args:
         fit: the likelihood.
         x: the start.
-        weight: of the total variation, in mm.
+        weight: weight of the total variation, in mm.
         level: mean sensitivity c.
         balance: ratio of dual to primal steps.
         steps: voxel size along (z, y, x), in mm.

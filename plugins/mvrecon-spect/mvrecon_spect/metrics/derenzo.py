@@ -22,7 +22,7 @@ class Sector(NamedTuple):
     """Result for the rods of one diameter.
 
     Args:
-        diameter: in mm.
+        diameter: diameter of the rods, in mm.
         ratios: valley-to-peak ratio of each pair of neighbours; infinite without a peak; empty for
             a single rod.
     """

@@ -23,7 +23,7 @@ class Mtf(NamedTuple):
     """A modulation transfer function.
 
     Args:
-        frequencies: in 1/mm, from zero to the Nyquist frequency.
+        frequencies: frequencies in 1/mm, from zero to the Nyquist frequency.
         values: 1 at zero.
     """
 

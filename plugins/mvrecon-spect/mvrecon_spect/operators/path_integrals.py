@@ -60,10 +60,10 @@ class _Frustum(NamedTuple):
         index: the pinhole's index (x, y, z) in the matter.
         world, along: mm, and steps of the index, per mm of depth: columns for a pixel along u,
             along v, and for pixel (0, 0).
-        length: from hole to detector in mm.
+        length: distance from hole to detector, in mm.
         rays: numbers along u and v.
         ends: first ray and distance of rays along u and v in pixels, and the first depth.
-        step, slabs: of depth in mm, and their number.
+        step, slabs: step of depth in mm, and number of steps.
     """
 
     start: Tensor

@@ -42,8 +42,8 @@ class Shared(TypedDict, total=False):
     """Options of `Spect` that other projectors of pinholes pass on.
 
     Args:
-        response: of pinhole and detector, with blur: "geometric", the parameters of a crystal, or
-            the path of a table, see `response_of`.
+        response: response of pinhole and detector, with blur: "geometric", the parameters of a
+            crystal, or the path of a table, see `response_of`.
         method: "footprints" of voxels, see `Footprints`; or "joseph": the thin ray of each pixel's
             centre, see `Drr`, for plain views of fine voxels and lists of bins.
         backend: as in `RayTransform`.

@@ -37,7 +37,7 @@ class Response:
         width_u, width_v: squared widths of the hole's image in mm^2.
         detector: variance in mm^2, along both axes.
         radial: further variance in mm^2 per squared tangent along an axis.
-        shift: in mm per tangent along an axis, by 1, t.
+        shift: displacement in mm per tangent along an axis, by 1, t.
         efficiency: counts per photon that passes the hole, by 1, t, t^2.
     """
 
@@ -77,7 +77,7 @@ def response_of(
         option: "geometric": the hole's image and the intrinsic resolution, at normal incidence;
             the options of `oblique`, `{angles: true, crystal_mm: .., attenuation_per_mm: ..}`; or
             the path of a table, see `measured`.
-        hole: with its penetration.
+        hole: a pinhole with its penetration.
         cameras: the pinholes.
         blur: whether there is any.
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
@@ -136,7 +136,7 @@ def oblique(
     Convention: the detector's plane of `Cameras` is at the mean depth of normal incidence.
 
     Args:
-        hole: with its penetration.
+        hole: a pinhole with its penetration.
         cameras: their corners limit the angles.
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
         crystal_mm: thickness of the crystal.
@@ -207,7 +207,7 @@ def measured(path: Path, cameras: Cameras) -> Response:
             `distance_mm` l from hole to detector, if that is not of all cameras. Variances are
             fitted in l / depth and 1 - cos, of as many terms as there are depths and
             angles, at most three and two.
-        cameras: with one distance from hole to detector, unless the table has it.
+        cameras: a rig with one distance from hole to detector, unless the table has it.
 
     Raises:
         ValueError: missing or unknown columns, impossible values, or several distances.
