@@ -417,10 +417,9 @@ def clusters(count: int, views: int, width: float, arc: float) -> list[float]:
 
 @pytest.mark.parametrize("rig_of", [beam, fan])
 def test_views_that_are_clustered_at_few_directions_are_named(rig_of):
-    """80 views at four directions measure as few lines as four, which their number hides: a rod
-    beside the axis is off by several per cent. As few even views, and exposures that an encoder
-    repeats, are what they seem. Also tried: 3 to 20 directions, 3 and 20 views of each, within 6
-    degrees, 8 to 120 random and golden angles, which are named as before.
+    """80 views at four directions measure as few lines as four, which their number hides. As few
+    even views, and exposures that an encoder repeats, are what they seem. Also tried: 3 to 20
+    directions, 3 and 20 views of each, within 6 degrees.
     """
     panel, arc = (LINE, 180.0) if rig_of is beam else (FAN, 360.0)
 
