@@ -28,7 +28,6 @@ from mvrecon.methods.calibration.from_data import (
     MAX_LEFT_OUT,
     OperatorOf,
     Problem,
-    derivatives,
     improved,
     unknowns,
 )
@@ -70,8 +69,8 @@ def refined_axis(
     The shift ends with the last size of voxels at which it predicts held-out views of the slice
     better than without, and well: those of an empty slice have nothing but noise. Voxels are
     halved down to a pixel's image, however coarse the grid is, as they bias the shift by a part of
-    their size. The uncertainty is how much the last size changed it, and at least that part
-    together with the standard error by noise; these alone where a smaller size changed it no more.
+    their size. The uncertainty is how much the last size changed it, and at least that part; that
+    part alone where a smaller size changed it no more.
 
     Args:
         operator_of: the operator of a rig on a grid.
@@ -101,12 +100,11 @@ def refined_axis(
             break
         part = rig.cropped((first, first + rows), (0, last)).binned((rows, columns))
         y = avg_pool2d(views[0, :, :, first : first + rows, :last], (rows, columns))[None]
-        cutoff = min(1.0, CUTOFF * columns / pixels)
-        change, error = _change(partial(operator_of, box), part, y, cutoff)
+        change = _change(partial(operator_of, box), part, y, min(1.0, CUTOFF * columns / pixels))
         if change == 0:
             uncertainty = min(uncertainty, least)  # of the voxels before
             break
-        offset, least = offset + columns * change, math.hypot(VOXEL_SHARE * pixels, columns * error)
+        offset, least = offset + columns * change, VOXEL_SHARE * pixels
         uncertainty = max(abs(columns * change), least)
         if abs(offset) > most_px:
             warnings.warn(
@@ -121,9 +119,9 @@ def refined_axis(
 
 def _change(
     operator_of: OperatorOf, cameras: Cameras, y: Float[Tensor, "1 1 m 1 u"], cutoff: float
-) -> tuple[float, float]:
-    """The shift of the slice's detectors, and its standard error; 0 where it does not improve the
-    prediction of held-out views. Steps oscillate about it, so it is their mean.
+) -> float:
+    """The shift of the slice's detectors; 0 where it does not improve the prediction of held-out
+    views. Steps oscillate about it, so it is their mean.
     """
     ramp = partial(RootRamp, cutoff=cutoff, device=y.device)
     shape, y = operator_of(cameras).domain_shape, ramp(y.shape[2:])(y)
@@ -137,22 +135,8 @@ def _change(
         if (values - last).abs().max() < MAX_FINAL_STEP:
             break
     values = (values + last) / 2
-    error = _standard_error(problem, values, x)
     without, left_out = (problem.left_out(at, ITERATIONS) for at in (still, values))
-    return (values[0, 0].item() if left_out < min(without, MAX_LEFT_OUT) else 0.0), error
-
-
-def _standard_error(
-    problem: Problem, values: Float[Tensor, "m 1"], x: Float[Tensor, "1 1 1 h w"]
-) -> float:
-    """The standard error of the shift by the views' noise: the root of the sum of squares of what
-    each view alone contributes to it (Huber's sandwich, Proc. 5th Berkeley Symp. 1, 1967).
-    """
-    A, r = problem.operator(values), problem.residual(values, x)
-    (effect,) = derivatives(lambda moved: problem.operator(moved)(x), values)
-    rest = effect - A(cgls(A, effect[None, None], ITERATIONS))[0, 0]
-    slopes = (rest * r[0, 0]).double().sum(dim=(1, 2))
-    return (slopes.norm() / rest.double().square().sum()).item()
+    return values[0, 0].item() if left_out < min(without, MAX_LEFT_OUT) else 0.0
 
 
 def _sides(grid: Grid, orbit: Orbit) -> Float[Tensor, "3"]:
