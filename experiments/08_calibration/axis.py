@@ -17,13 +17,15 @@ from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids
 
 COLUMNS, ROWS, VIEWS, PHOTONS = 192, 24, 120, 2e4
-#: Half acquisitions: share of the detector's width by which it is aside, and the object's radius
-#: relative to that of a centred detector's field; the radius is also that of truncated views.
-ASIDE, WIDER = 0.3, 1.4
+#: Share of the detector's width by which it is aside, and the object's radius relative to that of a
+#: centred detector's field: a half panel sees 6 to 17 columns beyond the axis.
+ASIDE = {"half acquisition": 0.3, "half panel": 0.44}
+WIDER = {"half acquisition": 1.4, "half panel": 1.6, "truncated": 1.4}
 ARCS = (
     "full turn",
     "half turn",
     "half acquisition",
+    "half panel",
     "full turn, truncated",
     "half turn, truncated",
 )
@@ -54,7 +56,7 @@ def scan(beam, arc, seed):
     """
     rng = torch.Generator().manual_seed(seed)
     half, rows = COLUMNS / 2, ROWS if beam == "cone" else 1
-    far, aside = (3 + 2 * torch.rand(1, generator=rng).item()) * half, arc == "half acquisition"
+    far = (3 + 2 * torch.rand(1, generator=rng).item()) * half
     degrees = 360.0
     if arc.startswith("half turn"):
         degrees = 180.0 if beam == "parallel" else 190 + 2 * math.degrees(math.asin(half / far))
@@ -63,9 +65,8 @@ def scan(beam, arc, seed):
     else:
         panel = {"pixels": [rows, COLUMNS], "pixel_mm": 1.5}
         rig = mv.circular(VIEWS, far, 1.5 * far, panel, arc_degrees=degrees)
-    radius = 0.9 * half * (WIDER if aside or arc.endswith("truncated") else 1)
-    if aside:
-        rig = rig.shifted(torch.tensor([[ASIDE * COLUMNS, 0.0]]))
+    radius = 0.9 * half * WIDER.get(arc.split(", ")[-1], 1)
+    rig = rig.shifted(torch.tensor([[ASIDE.get(arc, 0.0) * COLUMNS, 0.0]]))
     offset = 10 * torch.rand(1, generator=rng).item() - 5
     true = rig.shifted(torch.tensor([[offset, 0.0]])).refined(2)
     y = phantom(rng, radius, float(ROWS)).integrals(*true.rays()).float()
@@ -93,8 +94,10 @@ def main():
                     warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
                     _, fit = correction.calibrate(case, ["offset_u"], "cpu", Bar())
                 error = fit.misalignment.offset_px[0, 0].item() - offset
+                within = "" if fit.kept else f"{fit.uncertainty['offset_u']:.4f}"
                 row = {"beam": beam, "arc": arc, "seed": seed, "offset, px": f"{offset:.3f}"}
-                rows.append({**row, "error, px": f"{error:.4f}", "kept": " ".join(fit.kept)})
+                row |= {"error, px": f"{error:.4f}", "uncertainty, px": within}
+                rows.append({**row, "kept": " ".join(fit.kept)})
                 print(rows[-1], flush=True)
                 write_rows(options.out, rows)
 

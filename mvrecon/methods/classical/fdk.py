@@ -22,13 +22,12 @@ from mvrecon.methods.classical.orbit import along, beyond_rows, warn_of_axial_er
 from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
 from mvrecon.methods.classical.truncation import (
-    CUT_EDGE,
     PARTS,
     ROW_BLOCKS,
     continuation,
-    edge_shares,
     edges_of,
     ends_of,
+    reach_rows,
     truncated,
     warn_of_truncation,
 )
@@ -346,14 +345,9 @@ def filtered_backprojection(
         warn_of_truncation(torch.cat(edges, dim=2), filtering.extrapolate)
     # all that a single row sees extends beyond it, and a GPU would have to be waited for
     known = ends and cameras.shape[0] > 1
-    if plan.beyond_rows and not (known and _ends_within_rows(torch.cat(ends, dim=2))):
+    if plan.beyond_rows and (not known or reach_rows(torch.cat(ends, dim=2))):
         warnings.warn(plan.beyond_rows, stacklevel=2)
     return total
-
-
-def _ends_within_rows(ends: Float[Tensor, "b c m 2 10 i"]) -> bool:
-    """Whether objects do not reach the first and the last row of the views."""
-    return not (edge_shares(ends)[:, 0] > CUT_EDGE).any()
 
 
 def fdk_streamed(

@@ -37,7 +37,7 @@ GAP_STEPS, MIN_GAP, MAX_STEP_ANGLE = 5.0, math.radians(2.0), math.radians(125.0)
 EXPOSURE_STEP_SHARE = 0.2
 #: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step
 #: and than an even one. Views within the second angle are exposures of one, as encoders repeat it.
-NAMED_GAP, SAME_ANGLE = math.radians(8.0), math.radians(0.01)
+NAMED_GAP, SAME_ANGLE = math.radians(8.0), math.radians(0.05)
 #: The usual step is the least one such that steps up to it make up this part of the measured arc.
 USUAL_STEP_SHARE = 0.3
 #: A line that no ray measures is replaced by views within this angle, or within so many steps.

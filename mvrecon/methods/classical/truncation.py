@@ -40,6 +40,9 @@ CONTINUED_EDGE = 0.1
 #: Standard deviations of noise beyond which an edge shows an object, and the share of the views
 #: that show one from which a warning is given.
 MIN_DEVIATIONS, WARNED_VIEWS = 3.0, 0.1
+#: The same of the first and the last row of any view, and the standard deviations that no mean of
+#: thousands exceeds by chance.
+ROW_EDGE, ROW_DEVIATIONS = 0.02, 5.0
 #: What air reads is the lower quartile of the edges, up to a flat field that is a tenth off, and
 #: less than this part of the greatest line integral.
 AIR_QUANTILE, MAX_AIR, MAX_AIR_SHARE = 0.25, 0.1, 0.5
@@ -109,6 +112,16 @@ def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
     return edge_shares(ends_of(views)) > CUT_EDGE
 
 
+def reach_rows(ends: Float[Tensor, "b c m 2 10 i"]) -> bool:
+    """Whether an object reaches the first or the last row of any view: a mean over a block of its
+    columns is above noise and above what air reads, which is the lowest of these means.
+    """
+    edges, _, _, level, _, noise = ends[:, :, :, 0].split(PARTS, dim=-2)
+    top, lowest = level.amax(dim=(2, 3, 4), keepdim=True), edges.amin(dim=(2, 3, 4), keepdim=True)
+    air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
+    return bool((edges - air > ROW_EDGE * top + ROW_DEVIATIONS * noise).any())
+
+
 def truncated(edges: Float[Tensor, "b c k 10 i"]) -> Bool[Tensor, "b c k 1 1"]:
     """Whether views end inside the object, so that their rows are continued."""
     ends, _, shares, level, _, noise = edges.split(PARTS, dim=-2)
@@ -175,12 +188,12 @@ def _parabola(
 
 def _air(
     ends: Float[Tensor, "g k n i"], nexts: Float[Tensor, "g k n i"], top: Float[Tensor, "k 1 1"]
-) -> Float[Tensor, "k n 1"]:
+) -> tuple[Float[Tensor, "k n 1"], Float[Tensor, "k n 1"]]:
     """What air reads at each side: what the lowest edges of its groups of views and rows do, or
-    zero if that is too high for air.
+    zero if that is too high for air; and the same if a flat field may be off by up to a tenth.
 
-    It is air's if it is a small part of the greatest line integral; or if a flat field may be so
-    far off and the edges are as flat as air's: they grow inwards by less than a half of what an
+    It is air's if it is a small part of the greatest line integral. It may be that of a flat field
+    which is off if the edges are as flat as air's: they grow inwards by less than a half of what an
     ellipse of the greatest line integral does, whose squared line integrals are a parabola.
 
     Args:
@@ -193,16 +206,17 @@ def _air(
     inwards = 2 * (1 + BESIDE) * OUTERMOST  # twice the way in units of a half row
     ellipse = (lowest.square() + (top.square() - lowest.square()) * inwards).sqrt() - lowest
     off = (lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top) & (growth < ellipse / 2)
-    return torch.where((lowest < CUT_EDGE * top) | off, lowest, 0)
+    low = lowest < CUT_EDGE * top
+    return torch.where(low, lowest, 0), torch.where(low | off, lowest, 0)
 
 
 def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) -> None:
     """Warn of views that end inside the object, whose jump at the edge the ramp filter takes for
     a part of the object, or whose continuation is a guess.
 
-    An edge shows an object if it is above what air reads there by more than a flat field may be
-    off and than the noise of a group of views, see `_air`. Sides that other views measure better do
-    not count.
+    An edge shows an object if it is above what air reads there, see `_air`, and above the noise of
+    a group of views. Flat edges that a flat field may explain are named as either. Sides that other
+    views measure better do not count.
     """
     edges = edges.flatten(0, 1)
     count = min(VIEW_GROUPS, edges.shape[1])
@@ -216,9 +230,15 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     ends, nexts = (divided(grouped(x * used), seen, -math.inf) for x in (ends, nexts))
     most, top = (grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
     known, beside = (torch.where(seen > 0, x, torch.nan) for x in (ends, nexts))
-    air = _air(known, beside, top)
+    sure, possible = _air(known, beside, top)
     noise = grouped(noise) / math.sqrt(edges.shape[1] // count)
-    cut = (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)  # [g k i]
+
+    def cut_beyond(air: Float[Tensor, "k n 1"]) -> Bool[Tensor, "g k i"]:
+        return (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)
+
+    cut, either = cut_beyond(possible), False
+    if not (cut.double().mean(dim=0) > WARNED_VIEWS).any():
+        cut, either = cut_beyond(sure), True
     views = cut.double().mean(dim=0)
     worst = int(views.amax(dim=1).argmax())
     named = views[worst] > WARNED_VIEWS
@@ -227,8 +247,10 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     height = (ends.amax(dim=2) / most[:, 0])[:, worst][cut[:, worst]].mean().item()
     where, rows = f"{views[worst].max().item():.0%} of them", named.double().mean().item()
     where = where if rows == 1 else f"{where} and in {rows:.0%} of their rows"
+    off = 1 - math.exp(-possible[worst].max().item())
+    what = f"a wide, weak object, or their flat field is {off:.0%} off" if either else "the object"
     warnings.warn(
-        f"Views end inside the object: in {where} line integrals at a side of the detector are "
+        f"Views end inside {what}: in {where} line integrals at a side of the detector are "
         f"above noise and what air reads, in the mean {height:.0%} of the greatest ones, or of "
         f"{MAX_LEVEL:g} times their mean. "
         + (

@@ -434,6 +434,8 @@ def test_views_that_are_clustered_at_few_directions_are_named(rig_of):
         *(clusters(count, 1, 0.0, arc) for count in (3, 4, 8, 20, 80)),
         clusters(4, 20, 0.0, arc),
         clusters(4, 20, 0.1, arc),
+        clusters(12, 2, 0.04, arc),  # two exposures, by an encoder of 0.04 degrees
+        clusters(20, 3, 0.08, arc),
         clusters(60, 5, 1.0, arc),
     ):
         assert not named(angles), len(angles)
