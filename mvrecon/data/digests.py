@@ -19,8 +19,10 @@ from mvrecon.geometry.grid import Grid
 RIG_KEY = "rig"
 #: Significant decimals of a mm, so that processors' different sines give the same rig.
 SIGNIFICANT_DECIMALS = 9
-#: Most bytes of a text header that are searched, and what its lines state behind = or a colon.
-HEADER, STATED = 2**16, re.compile(r"^[^=:\n]*[=:]=?[ \t]*(\S.*?)\s*$", re.MULTILINE)
+#: Most bytes of a text header that are searched, and what its lines state behind = or a colon; no
+#: line with a NUL, which is none of text.
+HEADER = 2**16
+STATED = re.compile(r"^[^=:\n\0]*[=:]=?[ \t]*([^\s\0][^\n\0]*?)\s*$", re.MULTILINE)
 
 
 def of_rig(cameras: Cameras) -> str:
@@ -84,11 +86,9 @@ def _below(folder: Path, above: tuple[Path, ...] = ()) -> Iterator[Path]:
 
 
 def _stated_in(path: Path) -> list[Path]:
-    """The other files that the lines of a text file state, by their paths from its folder."""
+    """The other files that the lines of text in a file state, by their paths from its folder."""
     with open(path, "rb") as file:
         head = file.read(HEADER)
-    if b"\0" in head:
-        return []
     values = STATED.findall(head.decode("utf-8", "surrogateescape"))
     places = [path.parent / value for value in dict.fromkeys(values)]
     return [place for place in places if os.path.isfile(place) and place != path]

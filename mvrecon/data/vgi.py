@@ -29,7 +29,7 @@ KEYS = (
     Key("resolution, unit", "applied", "of [geometry]; the volume's centre is the origin"),
     Key("representation.size, representation.datatype", "compared", "with those of [file1]"),
     Key("representation.bitsperelement", "compared", "with that of [file1]"),
-    Key("datarange", "compared", "with that of [file1], and with all values, unless 0 -1"),
+    Key("datarange", "compared", "with that of [file1], and with all values, unless 0 -1 or 0 0"),
     Key("regionofinterestend", "compared", "with size of [file1]: the last voxel"),
     Key("fileformat", "refused", "plain numbers, little endian", ("raw",)),
     *(
@@ -105,20 +105,27 @@ def _range(path: Path, text: str, dtype: np.dtype) -> tuple[float, float]:
     Raises:
         Refused: no range, or one that integers of this type cannot have.
     """
-    if _plain(text) in ("", "0 -1"):
+    if _plain(text) in ("", "0 -1", "0 0"):
         return -math.inf, math.inf
     with file_errors(path, "has no datarange", "expected two numbers"):
         low, high = (float(word) for word in text.split())
+        share = ROUNDING * max(abs(low), abs(high))
+        below, above = (share + _half_a_digit(word) for word in text.split())
         ends = (-math.inf, math.inf)
         if dtype.kind != "f":
             ends = (float(np.iinfo(dtype).min), float(np.iinfo(dtype).max))
-        if not ends[0] <= low < high <= ends[1]:
+        if not (ends[0] <= low + below and low <= high and high - above <= ends[1]):
             raise Refused(
                 f"{path}: expected a datarange of values of {dtype.name} as they are stored, got "
                 f"{text}; store the values that it gives"
             )
-        rounding = ROUNDING * max(abs(low), abs(high))
-        return low - rounding, high + rounding
+        return low - below, high + above
+
+
+def _half_a_digit(word: str) -> float:
+    """Half a unit of the last digit of a number as it is written, by which it may be rounded."""
+    digits, _, exponent = word.lower().partition("e")
+    return float(f"0.5e{int(exponent or 0) - len(digits.partition('.')[2])}")
 
 
 def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:

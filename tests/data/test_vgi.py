@@ -89,6 +89,9 @@ REFUSED = {
     "12 bits": ({"kind": "unsigned integer", "bits": 12}, "BitsPerElement .8, 16, 32, 64"),
     "other bits in the head": ({"representation__bitsperelement": 16}, "expected the bitsper"),
     "values beyond a range": (_ranged("0 10"), "within the datarange 0 10, got -3"),
+    "values beyond the last digit": (_ranged("-3.00 19.99"), "within the datarange .*got 20"),
+    "another constant": (_ranged("5 5"), "within the datarange 5 5, got -3"),
+    "a range of the wrong way": (_ranged("20 -3"), "expected a datarange of values of float32"),
     "values above a range": (_ranged("-3 19.9"), "within the datarange -3 19.9, got 20"),
     "a range beyond the type": (
         _ranged("0 65535", kind="unsigned integer", bits=8, values=(VALUES + 3).astype("u1")),
@@ -123,3 +126,23 @@ def test_entries_of_vgstudio_that_change_nothing_are_accepted(tmp_path):
     for text in ("0 -1", "-3 20", "-1e3 1e3", "-3.00001 20"):
         volume, grid = read_volume(vgi(tmp_path, **neutral, **_ranged(text)))
         assert np.array_equal(volume.numpy(), VALUES) and np.allclose(grid.centre, 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        *((FLOATS / 7, f"{-3 / 7:{form}} {20 / 7:{form}}") for form in (".4f", ".3f", ".4g")),
+        (FLOATS * 1234.5, f"{-3 * 1234.5:.4g} {20 * 1234.5:.4g}"),
+        (np.linspace(0, 65535, 24).astype("<u2"), f"0 {65535:.4g}"),
+        (FLOATS * 0 + 5, "5 5"),
+        (FLOATS * 0 + 1 / 3, "0.3333 0.3333"),
+        (FLOATS, "0 0"),
+        (FLOATS * 0, "0 0"),
+        (FLOATS * 1e-6, "-0.0000 0.0000"),
+    ],
+)
+def test_a_range_of_vgstudio_is_compared_as_it_is_rounded(values, text, tmp_path):
+    """By half a unit of its last digit; 0 0 states nothing."""
+    kind = {"f": "float", "u": "unsigned integer"}[values.dtype.kind]
+    path = vgi(tmp_path, kind, 8 * values.itemsize, values=values, **_ranged(text))
+    assert np.array_equal(read_volume(path)[0].numpy().ravel(), values.ravel())

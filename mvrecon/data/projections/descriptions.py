@@ -64,12 +64,19 @@ KEYS = (
 )
 #: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
 OME, ATTRIBUTE = re.compile(r"<(\w+:)?OME\b"), re.compile(r"([\w-]+)\s*=\s*[\"']([^\"']*)[\"']")
+#: Parts of OME's description that may quote its elements: comments, and what other programs wrote.
+QUOTED = re.compile(
+    r"<!--.*?-->|<(?:\w+:)?(StructuredAnnotations|OriginalMetadata)\b[^>]*(?<!/)>"
+    r".*?</(?:\w+:)?\1\s*>",
+    re.DOTALL,
+)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
 
 
 def elements(text: str, name: str) -> list[dict[str, str]]:
     """The attributes of each element of OME's description of a name; none of other texts."""
+    text = QUOTED.sub("", text)
     found = re.findall(rf"<(?:\w+:)?{name}\b([^>]*)>", text) if OME.search(text) else []
     return [dict(ATTRIBUTE.findall(attributes)) for attributes in found]
 

@@ -14,13 +14,16 @@ from mvrecon.core.files.checks import Refused, shown
 #: an integer.
 DECIMAL = r"(?:(?<![0-9.])[0-9]+|(?<![^-+_ =]))\.[0-9]+(?![0-9.])"
 INTEGER = "[0-9]+"
-#: A number with an exponent, 5e-1 or 1.5e2; and one that may be two numbers, 1e2.
-SCIENTIFIC = r"(?<![0-9.])(?:[0-9]+(?:\.[0-9]+)?e[-+]|[0-9]+\.[0-9]+e)[0-9]{1,3}(?![0-9.a-z])"
-EXPONENT = r"(?<![0-9.])[0-9]+e[0-9]{1,3}(?![0-9.a-z])"
+#: A number with an exponent, 5e-1 or 1.5e2; and one that may be two numbers, 1e2. Not behind a
+#: letter of any alphabet: bone2e-001 is the first image of bone2e.
+APART = r"(?<![0-9a-z.]|[^ -~])"
+SCIENTIFIC = rf"{APART}(?:[0-9]+(?:\.[0-9]+)?e[-+]|[0-9]+\.[0-9]+e)[0-9]{{1,3}}(?![0-9.a-z])"
+EXPONENT = rf"{APART}[0-9]+e[0-9]{{1,3}}(?![0-9.a-z])"
 #: A decimal with a comma, which may be two numbers.
 COMMA = r"(?<![0-9.,])[0-9]+,[0-9]+(?![0-9.,])"
-#: A separator and a minus before a number, which is a sign.
-NEGATIVE = re.compile(r"[^a-z0-9]-$")
+#: A separator and a minus before a number, which is a sign; and an integer with leading zeros, a
+#: serial number, before which it is none.
+NEGATIVE, PADDED = re.compile("[_= ]-$"), re.compile("0[0-9]+")
 
 
 def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> list[Path]:
@@ -119,15 +122,16 @@ def _sorted(
 def _move_signs(parts: Sequence[list[str]]) -> None:
     """Move the + or - before a number to it, where some names have it and others do not, or
     another, or where a separator comes before it: in tilt_-10 and tilt_0 it is a sign, and in
-    tilt_-10 and tilt_-20; in scan-001 and scan-002 a dash.
+    tilt_-10 and tilt_-20; in scan-1 and scan-2 a dash, and in scan_-001 and scan_-002.
     """
     if len({len(part) for part in parts}) > 1:
         return
     for k in range(0, len(parts[0]) - 1, 2):
-        words = {part[k] for part in parts}
+        words, numbers = ({part[place] for part in parts} for place in (k, k + 1))
         signs = len(words) > 1 and len({re.sub("[-+]$", "", word) for word in words}) == 1
         negative = all(NEGATIVE.search(word) or word == "-" and k == 0 for word in words)
-        if signs or (negative and len({part[k + 1] for part in parts}) > 1):
+        serial = len(numbers) == 1 or any(map(PADDED.fullmatch, numbers))
+        if signs or (negative and not serial):
             for part in (part for part in parts if part[k][-1:] in ("+", "-")):
                 part[k], part[k + 1] = part[k][:-1], part[k][-1] + part[k + 1]
 

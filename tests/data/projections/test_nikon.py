@@ -128,7 +128,7 @@ REFUSED = {
     "no distance": ({"SrcToObject": None}, "expected the entry SrcToObject"),
     "a detector before the axis": ({"SrcToDetector": 50}, "expected 0 < SID < SDD"),
     "inverted images": ({"InvertedImages": "True"}, "expected InvertedImages .*got 'True'"),
-    "measured angles": ({"AngleFile": "tooth.ang"}, "expected no AngleFile, got 'tooth.ang'"),
+    "measured angles": ({"AngleFile": "tooth.ang"}, "expected AngleFile .*got 'tooth.ang'"),
     "angles of one's own": ({"Angles": "custom"}, "expected Angles equal .*got 'custom'"),
     "normalised flux": ({"FluxNormalisation": "true"}, "expected FluxNormalisation"),
     "no number": ({"AngularStep": "x"}, "AngularStep"),
@@ -169,10 +169,12 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
             nikon.read(xtekct(tmp_path, **{name: value}))
     own = {"OffsetZ": 4, "Scaling": 1000, "OutputUnits": "/m", "TIFFScaling": 1, "Scale": 1.32}
     own |= {"AutomaticCentreOfRotation": 1, "AutoScalingType": 2, "ImportConversion": 1}
-    own |= {"InvertedImages": "False", "AngleFile": "", "Angles": "Equidistant"}
+    own |= {"InvertedImages": "False", "Angles": "Equidistant"}
     own |= {"FluxNormalisation": 0, "FramesPerProjection": 4}
     with warnings.catch_warnings(action="error"):
-        nikon.read(xtekct(tmp_path, **own, BlackLevel=0, Conveyor="False", DetectorTilt=""))
+        for none in ("", "none", "NONE"):
+            own |= {"AngleFile": none}
+            nikon.read(xtekct(tmp_path, **own, BlackLevel=0, Conveyor="False", DetectorTilt=""))
 
 
 @pytest.mark.parametrize(

@@ -232,6 +232,16 @@ def test_an_index_beside_another_number_shows_that_no_view_is_missing(tmp_path):
         ["2021-03-05_-5", "2021-03-05_0", "2021-03-05_5"],
         ["proj_-0.5", "proj_0.5", "proj_1.5", "proj_2.5"],
         ["a_-_1", "a_-_2", "a_-_3"],
+        *(
+            [f"{start}-{k:0{digits}}" for k in range(9, 12)]
+            for start, digits in {
+                **dict.fromkeys(["Probe (A)", "sample ", "scan-", "scan_", "a=", ""], 3),
+                **dict.fromkeys(["[run3]", "Dr. X.", "10%", "Schädelmaß", "Préparé", "µ"], 1),
+                **{"样品": 1, "e\u0301": 1},
+            }.items()
+        ),
+        ["-000", "-001", "-002"],
+        ["p_-10_-001", "p_-5_-002", "p_0_-003"],
         ["2021-03-05", "2021-03-06", "2021-03-07"],
     ],
 )
@@ -258,12 +268,22 @@ def test_a_sign_is_part_of_a_number_and_a_dash_is_not(names, tmp_path):
         ["p_-1e-1", "p_0e-1", "p_1e-1"],
         ["p_-2e-1_a", "p_-1e-1_a", "p_1e-1_a"],
         ["p_1e1", "p_1e2", "p_1e3"],
+        ["proj_1e-1", "proj_5e-1"],
+        [f"bone2e-{k:03}" for k in range(1, 13)],
+        [f"Sample3E-{k}" for k in range(8, 12)],
+        [f"x1.5e{k:02}" for k in range(1, 13)],
+        ["p1e1", "p1e2", "p5e1", "p5e2"],
+        *([f"{start}2e-{k}" for k in range(8, 12)] for start in ("Maß", "e\u0301", "样品")),
     ],
 )
 def test_numbers_with_exponents_decide_the_order(names, tmp_path):
-    """That of 1e1, 1e2 and 1e3 is the same for numbers and for two numbers."""
+    """That of 1e1, 1e2 and 1e3 is the same for numbers and for two numbers; behind a letter they
+    are two numbers.
+    """
     paths = [tmp_path / f"{name}.tif" for name in names]
     assert ordered(paths[::-1], gaps=True) == paths
+    if names[0] in ("bone2e-001", "Sample3E-8", "x1.5e01"):
+        assert ordered(paths[::-1]) == paths
 
 
 @pytest.mark.parametrize(

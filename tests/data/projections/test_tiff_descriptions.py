@@ -41,6 +41,17 @@ def exposed():
     return light.round().astype("u2")
 
 
+#: Other times, in places that are no part of the description.
+TIMES = planes([(k, 7 * k + 1) for k in range(4)]) + '<x:Plane ExposureTime="3"/>'
+QUOTED = {
+    "comment": f"<!-- As before:\n{TIMES} -->",
+    "annotations": f"<SA:StructuredAnnotations ID='a'>\n{TIMES}</SA:StructuredAnnotations >",
+    "original": f"<OriginalMetadata>{TIMES}<!-- </OME> --></OriginalMetadata><Plane/>",
+    "empty": f"<OriginalMetadata/><!-- --><OriginalMetadata>{TIMES}</OriginalMetadata>",
+}
+
+
+@pytest.mark.parametrize("quoted", ["", *QUOTED])
 @pytest.mark.parametrize(
     ("unit", "factor", "prefix"),
     [
@@ -52,13 +63,15 @@ def exposed():
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*several values")
-def test_exposure_times_of_ome_are_applied_by_their_name(unit, factor, prefix, tmp_path):
+def test_exposure_times_of_ome_are_applied_by_their_name(unit, factor, prefix, quoted, tmp_path):
     """In their units, of s without one, and in the order of the images, also with a prefix of
-    names. Without views.exposure, views and flat fields that differ are warned of.
+    names, but not those of comments and annotations. Without views.exposure, views and flat fields
+    that differ are warned of.
     """
     times = [(k, 20 * factor * e) for k, e in enumerate(EXPOSURES)]
     text = planes(times, unit, -1).replace("<Plane", f"<{prefix}Plane")
-    views = ome(tmp_path / "views.ome.tif", exposed(), text)
+    before, _, after = QUOTED.get(quoted, "").partition("<!-- -->")
+    views = ome(tmp_path / "views.ome.tif", exposed(), text + after, more=before)
     flat = np.full((1, 6, 8), FLAT, "u2")
     flat = ome(tmp_path / "flat.ome.tif", flat, planes([(0, 20 * factor)], unit))
     options = {"flat": str(flat), "find_bad_pixels": False}

@@ -37,7 +37,7 @@ KEYS = (
     Key("DetectorOffsetX, DetectorOffsetY", "refused", "give camera=circular an offset_mm", (0,)),
     Key("Shuttling", "refused", "images in the order of their angles", NO),
     Key("InvertedImages", "refused", "grey values that rise with intensity", NO),
-    Key("AngleFile", "refused", "AngularStep alone; give camera=circular with camera.angles"),
+    Key("AngleFile", "refused", "AngularStep alone; give camera=circular with camera.angles", NO),
     Key(
         "Angles",
         "refused",
