@@ -178,7 +178,11 @@ def test_exposures_of_nexus_are_applied_by_their_name(name, tmp_path):
         ({"Grid": ["FIXED", "FOCUSED"]}, {"Grid": ["FOCUSED", "FIXED"]}, None),
         ({"Grid": ["FIXED", "FOCUSED"]}, {"Grid": ["FIXED"]}, "Grid FIXED, its views have"),
         ({"FilterThicknessMinimum": [1, 2]}, {"FilterThicknessMinimum": [2.0, 1.0]}, None),
-        ({"FilterThicknessMinimum": [1, 2]}, {"FilterThicknessMinimum": [1, 3]}, "Minimum [1, 3]"),
+        (
+            {"FilterThicknessMinimum": [1, 2]},
+            {"FilterThicknessMinimum": [1, 3]},
+            "Minimum [1.0, 3.0]",
+        ),
         ({"GridID": "100001"}, {"GridID": "100002"}, "GridID 100002, its views have 100001"),
         ({"Exposure": 4}, {}, None),
     ],
