@@ -11,7 +11,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import Refused, millimetres, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.projections.exposures import in_base_units
+from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import Header
 
 #: OME's types of pixels.
@@ -72,6 +72,8 @@ QUOTED = re.compile(
 )
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
+#: A comma between thousands.
+THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
 def elements(text: str, name: str) -> list[dict[str, str]]:
@@ -90,41 +92,51 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
         text: the description of the page.
         manager: metadata of Micro-Manager, None of others.
 
-    Raises:
-        Refused: entries that are no numbers, or more bits than pixels have.
+    Warns:
+        UserWarning: entries that are no numbers, or more bits than pixels have; they are not used.
     """
     stated = {name: list(texts) for name, texts in head.stated.items()}
     if isinstance(manager, dict):
-        if manager.get("BitDepth") is not None:
-            head = head._replace(tops=_tops(file, "BitDepth", manager["BitDepth"], head))
-        if (ms := manager.get("Exposure-ms")) is not None:
-            _add(stated, "ExposureTime", 0, milliseconds(file, float(ms), "ms"))
+        bits, ms = (_of_manager(file, name, manager) for name in ("BitDepth", "Exposure-ms"))
+        if bits is not None:
+            with unneeded():
+                head = head._replace(tops=_tops(file, "BitDepth", bits, head))
+        if ms is not None:
+            _add(stated, "ExposureTime", 0, milliseconds(file, ms, "ms"))
     entries = dict(LINE.findall(text))
     if not {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
         return head._replace(stated=stated)
 
     def numbers(name: str, count: int = 1) -> tuple[list[float], str]:
-        found = NUMBER.findall(entries[name])
-        if len(found) < count:
+        text = THOUSANDS.sub("", entries[name]) if name == "Count_cutoff" else entries[name]
+        found = NUMBER.findall(text)
+        if len(found) < count or re.search(r"\d,\d", text):
             raise Refused(f"{file}: expected {name} as {count} numbers, got {shown(entries[name])}")
         return [float(number) for number, _ in found[:count]], found[0][1]
 
     for name in {*DECTRIS_BEAM} & {*entries}:
         _add(stated, name, 0, entries[name])
     if "Exposure_time" in entries:
-        (time,), unit = numbers("Exposure_time")
-        _add(stated, "ExposureTime", 0, milliseconds(file, time, unit))
+        with unneeded():
+            (time,), unit = numbers("Exposure_time")
+            _add(stated, "ExposureTime", 0, milliseconds(file, time, unit))
     if "Filter_transmission" in entries:
-        _add(stated, "Filter_transmission", 0, f"{numbers('Filter_transmission')[0][0]:g}")
+        with unneeded():
+            _add(stated, "Filter_transmission", 0, f"{numbers('Filter_transmission')[0][0]:g}")
     if "Count_cutoff" in entries:
-        head = head._replace(tops=frozenset(numbers("Count_cutoff")[0]))
+        with unneeded():
+            ((top,), _) = numbers("Count_cutoff")
+            head = head._replace(tops=frozenset([top])) if top > 0 else head  # -1: none
     if "Pixel_size" in entries:
-        (right, down), unit = numbers("Pixel_size", 2)
-        mm = millimetres(file, unit)
-        head = head._replace(pixel_mm=(down * mm, right * mm))
+        with unneeded():
+            (right, down), unit = numbers("Pixel_size", 2)
+            mm = millimetres(file, unit)
+            head = head._replace(pixel_mm=(down * mm, right * mm))
     if head.dtype.kind == "i":
-        excluded = numbers("N_excluded_pixels")[0] if "N_excluded_pixels" in entries else [0]
-        head = head._replace(excluded=int(excluded[0]))
+        head = head._replace(excluded=0)
+        with unneeded():
+            if "N_excluded_pixels" in entries:
+                head = head._replace(excluded=int(numbers("N_excluded_pixels")[0][0]))
     return head._replace(stated=stated)
 
 
@@ -155,9 +167,16 @@ def of_file(file: Path, head: Header, text: str) -> Header:
         page = sum(int(plane.get(f"The{axis}", 0)) for axis in "ZCT")  # one of them runs
         if "ExposureTime" in plane and page < head.pages:
             unit = plane.get("ExposureTimeUnit", "s")
-            time = milliseconds(file, float(plane["ExposureTime"]), unit)
-            _add(stated, "ExposureTime", page, time, head.pages)
+            if (time := number_of(plane["ExposureTime"], f"{file}: ExposureTime")) is not None:
+                _add(stated, "ExposureTime", page, milliseconds(file, time, unit), head.pages)
     return head._replace(stated=stated)
+
+
+def _of_manager(file: Path, name: str, entries: dict[str, Any]) -> float | None:
+    """A number of Micro-Manager, also in a property map; None of other entries."""
+    value = entries.get(name)
+    value = value.get("PropVal") if isinstance(value, dict) else value
+    return None if value is None else number_of(value, f"{file}: {name}")
 
 
 def milliseconds(file: Path, time: float, unit: str) -> str:

@@ -2,9 +2,11 @@
 by name.
 """
 
+import math
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -68,12 +70,17 @@ PREFIXES = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "n": 1e-9}
 PREFIXES |= {"milli": 1e-3, "micro": 1e-6, "nano": 1e-9}
 SECONDS, AMPERES = (
     {"": 1.0, **{start + name: part for start, part in PREFIXES.items() for name in names}}
-    for names in (("s", "sec", "second", "seconds"), ("a", "amp", "ampere", "amperes"))
+    for names in (
+        ("s", "sec", "secs", "second", "seconds", "second(s)"),
+        ("a", "amp", "ampere", "amperes"),
+    )
 )
 SECONDS |= dict.fromkeys(("min", "minute", "minutes"), 60.0)
 SECONDS |= dict.fromkeys(("h", "hour", "hours"), 3600.0)
-#: Relative difference of exposures, or of the beam, that counts.
-MAX_CHANGE = 0.01
+#: Relative difference of exposures, and of numbers of the beam, that counts.
+MAX_CHANGE, MAX_BEAM_CHANGE = 0.01, 1e-3
+#: A number as text, with its unit.
+NUMBER = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\D*)")
 
 
 def kind_of(name: str) -> str:
@@ -108,6 +115,33 @@ def in_base_units(values: np.ndarray, name: str, unit: str, where: object) -> np
     return values * factor
 
 
+@contextmanager
+def unneeded(cure: str = "") -> Iterator[None]:
+    """Warn of what is refused within, instead of raising, as the views do not need it."""
+    try:
+        yield
+    except Refused as error:
+        warnings.warn(f"{error}; it is not used{cure}", stacklevel=4)
+
+
+def number_of(text: object, where: str) -> float | None:
+    """A number that the views do not need; None of what is none, with a warning.
+
+    Args:
+        text: as a file states it.
+        where: it is stated: file and name, for the message.
+    """
+    with unneeded():
+        try:
+            value = float(str(text))
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise Refused(f"{where}: expected a number, got {shown(text)}")
+        return value
+    return None
+
+
 def named(exposure: str | Path) -> list[str]:
     """The attributes that are joined by `*` in an option; empty if it is a file, or others."""
     names = [name.strip() for name in str(exposure).split("*")]
@@ -122,7 +156,8 @@ def exposure_names(views: ProjectionStack, exposure: str | Path | None) -> list[
 
 
 def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "") -> None:
-    """Warn of views that state several values of an attribute.
+    """Warn of views that state several values of an attribute, but for numbers that differ by no
+    more than counts.
 
     Args:
         path: of the views.
@@ -132,16 +167,60 @@ def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "")
     """
     stated = {word for text in texts for word in text.split(" or ")} - {""}
     own = "" if kind_of(name) == "beam" else f"{name} or "
+    default = not cure  # others are places, of which every difference counts
     cure = cure or (
         f"for which their grey values are not corrected but by views.exposure={own}<file> with "
         f"exposures relative to the flat field's"
     )
-    if len(stated) > 1:
+    if len(stated) < 2:
+        return
+    within = _counting(name) if default else 0.0
+    numbers = _numbers(stated)
+    apart = (np.ptp(x, axis=0) > within * np.abs(x).max(axis=0) for x in numbers.values())
+    if len(numbers) > 1 or any(differ.any() for differ in apart):
         warnings.warn(
             f"{path}: views have several values of {name}, {' or '.join(sorted(stated)[:3])}, "
             f"{cure}",
             stacklevel=3,
         )
+
+
+def _numbers(words: Iterable[str]) -> dict[tuple[str, ...], np.ndarray]:
+    """What words state, in any case: by the units of one or several numbers, or by other texts, of
+    which the order does not count, a row of the numbers of each word.
+    """
+    rows: dict[tuple[str, ...], list[list[float]]] = {}
+    for word in words:
+        parts = sorted(map(_quantity, word.strip("[]()").split(",")))
+        rows.setdefault(tuple(unit for unit, _ in parts), []).append([x for _, x in parts])
+    return {units: np.array(own) for units, own in rows.items()}
+
+
+def _quantity(text: str) -> tuple[str, float]:
+    """The unit of a number, and the number; another text, and 0."""
+    if (number := NUMBER.fullmatch(text.strip(" '\""))) is None:
+        return text.strip(" '\"").casefold(), 0.0
+    unit = number[2].strip()
+    start = "M" if unit[:1] == "M" else ""  # mega, not milli
+    return start + unit[len(start) :].casefold(), float(number[1])
+
+
+def _counting(name: str) -> float:
+    """The relative difference of an attribute's numbers from which on it counts."""
+    if kind_of(name) != "beam":
+        return MAX_CHANGE
+    return 0.0 if name.endswith("ID") else MAX_BEAM_CHANGE
+
+
+def _same_beam(name: str, own: set[str], other: set[str]) -> bool:
+    """Whether each word of either is one of the other, or as near to it as does not count."""
+    a, b = _numbers(own), _numbers(other)
+    return a.keys() == b.keys() and all(
+        np.isclose(near, row, rtol=_counting(name), atol=0).all(axis=1).any()
+        for units in a
+        for rows, near in ((a[units], b[units]), (b[units], a[units]))
+        for row in rows
+    )
 
 
 def relative_exposure(
@@ -256,9 +335,12 @@ def warn_of_others(
         if (name == "dark" and kind != "time") or (name == "flat" and applied and kind != "beam"):
             continue
         if kind == "beam":
-            sets = ({*one} - {""} for one in (texts, field.stated.get(key, ())))
+            sets = [
+                {word for text in one for word in text.split(" or ")} - {""}
+                for one in (texts, field.stated.get(key, ()))
+            ]
             own, other = (" or ".join(sorted(one)[:3]) for one in sets)
-            same = not own or not other or own == other
+            same = not own or not other or _same_beam(key, *sets)
         else:
             ratio = _relative(views, field, [key])
             same = ratio is None or np.abs(ratio - 1).max() <= MAX_CHANGE

@@ -190,6 +190,7 @@ class ImageFiles(ProjectionStack):
             cure = "which the camera must have" if name in CAMERA_PLACES else ""
             exposures.warn_of_several(files[0].parent, name, texts, cure)
         self.files, self._excluded = list(files), headers[0].excluded
+        self.negative_is_bad = self._excluded is not None
         self.pixel_mm, self._tops = (
             headers[0].pixel_mm,
             frozenset().union(*(head.tops for head in headers)),

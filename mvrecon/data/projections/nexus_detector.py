@@ -5,8 +5,6 @@ and greatest grey value (Könnecke and others, J. Appl. Cryst. 48, 2015).
 import math
 import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +13,7 @@ from mvrecon.core.files.checks import Refused, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import MissingFile, Place, followed, texts_at, values_at
 from mvrecon.data.projections import exposures
+from mvrecon.data.projections.exposures import unneeded
 from mvrecon.data.projections.frames import EXPECTED, Frames
 from mvrecon.data.storage import check_chunks, dataset_in, opened
 
@@ -31,15 +30,20 @@ BEAM = (
     *("instrument/monochromator/energy", "instrument/source/voltage"),
 )
 #: Single numbers of a detector.
-NUMBERS = ("saturation_value", "bit_depth_readout", "underload_value")
+NUMBERS = ("saturation_value", "underload_value")
 #: The type of numbers, and a number as text, with its unit.
 NUMERIC = re.compile(r"(u?int|float|bool)\d*")
 NUMBER = re.compile(r"([-+.\d]+(?:[eE][-+]?\d+)?)\s*(\D*)")
 KEYS = (
     Key("pixel_mask", "applied", "bad pixels, all but 0; another size is warned of"),
-    Key("saturation_value, bit_depth_readout", "applied", "the greatest grey value; the first"),
+    Key("saturation_value", "applied", "the greatest grey value, where positive"),
+    Key("bit_depth_readout", "ignored", "of the readout: images that sum several hold more"),
     Key("underload_value", "compared", "with 0; warned of"),
-    Key("sequence_number", "compared", "with the order of the views; gaps are warned of"),
+    Key(
+        "sequence_number",
+        "compared",
+        "with the order of the views, also where it starts again at 0; gaps are warned of",
+    ),
 )
 
 
@@ -61,7 +65,7 @@ def of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarra
     """
     stated, views = np.full(len(keys), "", object), keys == VIEW
     texts: list[str] = []
-    with _unneeded():
+    with unneeded():
         texts = _texts_of(name, place, unit)
         if len(texts) not in (1, len(keys), views.sum()):
             raise Refused(
@@ -132,16 +136,13 @@ def limits_of(
     if numbers.get("underload_value", 0) > 0:
         place = places["underload_value"]
         warnings.warn(f"{place}: is not applied: values below it are wrong", stacklevel=2)
-    top, bits = (numbers.get(name) for name in ("saturation_value", "bit_depth_readout"))
-    if not top and bits and frames.dtype.kind in "iu":
-        top = min(2.0**bits - 1, float(np.iinfo(frames.dtype).max))
-    place = places.get("pixel_mask")
-    return None if place is None else _mask(place, frames.shape[1:]), top or None
+    top, place = numbers.get("saturation_value", 0.0), places.get("pixel_mask")
+    return None if place is None else _mask(place, frames.shape[1:]), top if top > 0 else None
 
 
 def _number(place: Place) -> float:
     """A number of a detector; 0 of another one, with a warning."""
-    with _unneeded():
+    with unneeded():
         values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
         if len(values) != 1 or not np.isfinite(values[0]):
             raise Refused(f"{place}: expected one number, got {shown(values.tolist())}")
@@ -151,7 +152,7 @@ def _number(place: Place) -> float:
 
 def _mask(place: Place, shape: tuple[int, ...]) -> np.ndarray | None:
     """Bad pixels by a detector's mask [v u]; None of another one, with a warning."""
-    with _unneeded("; give it as views.bad_pixels"), opened(place.path, EXPECTED) as file:
+    with unneeded("; give it as views.bad_pixels"), opened(place.path, EXPECTED) as file:
         stored = dataset_in(place.path, file, place.name, EXPECTED)
         if stored.dtype.kind not in "biu" or (*stored.shape[-2:], stored.size) != (
             *shape,
@@ -164,36 +165,34 @@ def _mask(place: Place, shape: tuple[int, ...]) -> np.ndarray | None:
     return None
 
 
-@contextmanager
-def _unneeded(cure: str = "") -> Iterator[None]:
-    """Warn of what is refused within, instead of raising, as the views do not need it."""
-    try:
-        yield
-    except Refused as error:
-        warnings.warn(f"{error}; it is not used{cure}", stacklevel=4)
-
-
 def _check_sequence(place: Place, keys: np.ndarray) -> None:
     """Compare the sequence numbers of frames, counted for all or for each kind, with their order.
 
     Warns:
-        UserWarning: frames between views are missing, or another number of numbers.
+        UserWarning: frames between views are missing, no numbers, or another number of them.
 
     Raises:
         Refused: views are not in the order of their numbers.
     """
-    numbers, views = values_at(place, EXPECTED, ("units",)).ravel(), np.flatnonzero(keys == VIEW)
-    if len(numbers) not in (len(keys), len(views)):
-        warnings.warn(
-            f"{place}: expected a number of each of {len(keys)} frames or {len(views)} views, got "
-            f"{len(numbers)}, which are not used",
-            stacklevel=2,
-        )
+    own, views = np.zeros(0), np.flatnonzero(keys == VIEW)
+    with unneeded():
+        numbers = values_at(place, EXPECTED, ("units",)).ravel()
+        if len(numbers) not in (len(keys), len(views)):
+            raise Refused(
+                f"{place}: expected a number of each of {len(keys)} frames or {len(views)} views, "
+                f"got {len(numbers)}"
+            )
+        chosen = numbers[views] if len(numbers) == len(keys) else numbers
+        if not np.isfinite(chosen).all():
+            raise Refused(f"{place}: expected a number of each view, got {shown(chosen.tolist())}")
+        own = chosen
+    if not (own != own[:1]).any():  # never filled
         return
-    own = (numbers[views] if len(numbers) == len(keys) else numbers).astype(float)
-    steps, apart = np.diff(own), np.diff(views)
-    if not steps.any():  # never filled
-        return
+    apart = np.diff(views)
+    steps = np.diff(own if own.dtype.kind == "u" else own.astype(float))
+    if own.dtype.kind == "u":  # counters start again at 0; from half a turn on it is a step back
+        one_each = steps == apart.astype(own.dtype)
+        steps = np.where(one_each, apart, steps.astype(f"i{own.dtype.itemsize}"))
     if (steps <= 0).any():
         first = int(np.argmax(steps <= 0))
         raise Refused(

@@ -15,6 +15,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_declared, io_library
 from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.data.projections.exposures import number_of
 from mvrecon.data.projections.stack import Header
 
 #: Formats by their ending.
@@ -158,8 +159,9 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]]]:
     counters = dict(
         zip(*(stated.get(f"counter_{end}", "").split() for end in ("mne", "pos")), strict=False)
     )
-    times = {stated[name.lower()] for name in EDF_TIMES if stated.get(name.lower())}
-    exposed = {f"{1000 * float(t):.6g}" for t in times if re.fullmatch(r"[-+.\deE]+", t)}
+    times = {name: stated[name.lower()] for name in EDF_TIMES if stated.get(name.lower())}
+    numbers = (number_of(text, f"{file}: {name}") for name, text in times.items())
+    exposed = {f"{1000 * time:.6g}" for time in numbers if time is not None}
     texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
     return kind, {name: [text] for name, text in texts.items() if text}
 

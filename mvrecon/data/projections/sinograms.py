@@ -30,6 +30,7 @@ class Sinograms(ProjectionStack):
             for name, field in slices.fields.items()
         }
         self.rig, self.mirrored = slices.rig, slices.mirrored
+        self.negative_is_bad = slices.negative_is_bad
 
     @property
     def top(self) -> float | None:

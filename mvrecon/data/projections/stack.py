@@ -96,6 +96,8 @@ class ProjectionStack(ABC):
     affine: np.ndarray | None = None
     #: Whether views, and fields beside them, are stored as seen from the detector's back.
     mirrored: bool = False
+    #: Whether negative values mark pixels that a view could not measure.
+    negative_is_bad: bool = False
     #: Flat and dark fields that the file itself has, by "flat" and "dark".
     fields: Mapping[str, "ProjectionStack | float"] = {}
     #: Exposure, beam and places that the files state, by name: a text for each view, "" of none.

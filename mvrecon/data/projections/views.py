@@ -177,8 +177,8 @@ class Corrected:
         views: line integrals, float32 (or the stored values, if not grey values).
         mask: measured pixels, no part of which is dead or saturated.
         odd: numbers of pixels by name: "saturated", before binning; "floored", whose transmission
-            was at most the floor; "zingers", bright in a single view; and "negative", line
-            integrals below `NEGATIVE`.
+            was at most the floor; "zingers", bright in a single view; "unread", which a file marks
+            as bad in a view; and "negative", line integrals below `NEGATIVE`.
     """
 
     views: Float[Tensor, "m v u"]
@@ -376,12 +376,15 @@ class MeasuredViews:
             few = self._few
             bright = (zingers(light.swapaxes(0, 1)).swapaxes(0, 1) if few else zingers(light))[kept]
         raw, values = raw[kept], values[kept]
-        for k in bright.flatten(1).any(dim=1).nonzero().flatten().tolist():
-            values[k] = filled(values[k : k + 1], bright[k])[0]
-        mask = ~(bad | bright)
+        unread = (raw < 0) & ~bad if self.stack.negative_is_bad else torch.zeros_like(bright)
+        lost = bright | unread
+        for k in lost.flatten(1).any(dim=1).nonzero().flatten().tolist():
+            values[k] = filled(values[k : k + 1], bad | lost[k])[0]
+        mask = ~(bad | lost)
         if self.kind != "intensities":
             views = self.region.binned(values, counts=self.kind == "counts")
             odd = Counter(zingers=int(bright.sum()), negative=int((views < NEGATIVE).sum()))
+            odd["unread"] = int(unread.sum())
             return Corrected(views, self.region.all_binned(mask), odd)
         saturated = (raw >= self.saturation) & mask
         mask = self.region.all_binned(mask & ~saturated)
@@ -394,7 +397,7 @@ class MeasuredViews:
                 f"{self.options.path}: expected light in every view, got none above the dark field "
                 f"in {name} (shutter closed, or dark and flat swapped?)"
             )
-        found = {"saturated": saturated, "floored": low, "zingers": bright}
+        found = {"saturated": saturated, "floored": low, "zingers": bright, "unread": unread}
         found["negative"] = views < NEGATIVE
         return Corrected(views, mask, Counter({name: int(x.sum()) for name, x in found.items()}))
 
@@ -496,8 +499,8 @@ class MeasuredViews:
         """All views in order, in chunks of a number of pixels on disk.
 
         Warns:
-            UserWarning: after the last, the number of pixels that were saturated, at the floor or
-                bright in a single view; most line integrals are negative.
+            UserWarning: after the last, the number of pixels that were saturated, at the floor,
+                bright or unread in single views; most line integrals are negative.
         """
         step = max(1, pixels // math.prod(self.stack.shape))
         odd = Counter[str]()
@@ -532,8 +535,8 @@ class MeasuredViews:
         return self.region.cropped(raw.flip([axis - 2 for axis in (0, 1) if self.flips[axis]]))
 
     def warn_of_values(self, odd: Counter[str]) -> None:
-        """Warn of pixels that were saturated, at the floor or bright in a single view, if any, and
-        of line integrals most of which are negative.
+        """Warn of pixels that were saturated, at the floor, bright or unread in single views, if
+        any, and of line integrals most of which are negative.
         """
         if 2 * odd["negative"] > (pixels := self.n_views * math.prod(self.shape)):
             cause = (
@@ -552,6 +555,12 @@ class MeasuredViews:
                 f"{self.options.path}: {bright} pixels of {self.n_views} views are brighter than "
                 f"all their neighbours in one view (zingers); they are filled from these and left "
                 f"out of the mask",
+                stacklevel=3,
+            )
+        if unread := odd["unread"]:
+            warnings.warn(
+                f"{self.options.path}: {unread} pixels of {self.n_views} views are negative, which "
+                f"marks bad ones; they are filled from their neighbours and left out of the mask",
                 stacklevel=3,
             )
         if saturated := odd["saturated"]:

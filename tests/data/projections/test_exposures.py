@@ -172,6 +172,18 @@ def test_exposures_of_nexus_are_applied_by_their_name(name, tmp_path):
         ({"DetectorMode": "LOW"}, {"DetectorMode": "HIGH"}, "DetectorMode HIGH, its views have"),
         ({"HalfValueLayer": "3"}, {"HalfValueLayer": "9"}, "HalfValueLayer 9, its views have 3"),
         ({"Exposure": 4}, {"Exposure": 4}, None),
+        ({"KVP": "80"}, {"KVP": "80.0"}, None),
+        ({"KVP": "80"}, {"KVP": "80.05"}, None),
+        ({"KVP": "80"}, {"KVP": "81"}, "KVP 81, its views have 80"),
+        ({"Grid": ["FIXED", "FOCUSED"]}, {"Grid": ["FOCUSED", "FIXED"]}, None),
+        ({"Grid": ["FIXED", "FOCUSED"]}, {"Grid": ["FIXED"]}, "Grid FIXED, its views have"),
+        ({"FilterThicknessMinimum": [1, 2]}, {"FilterThicknessMinimum": [2.0, 1.0]}, None),
+        (
+            {"FilterThicknessMinimum": [1, 2]},
+            {"FilterThicknessMinimum": [1, 3]},
+            "Minimum [1.0, 3.0]",
+        ),
+        ({"GridID": "100001"}, {"GridID": "100002"}, "GridID 100002, its views have 100001"),
         ({"Exposure": 4}, {}, None),
     ],
 )
@@ -603,6 +615,9 @@ UNITS = {
     "μs": 1e6,
     "sec": 1,
     "Minutes": 1 / 60,
+    "SECS": 1,
+    "Second(s)": 1,
+    "millisecond(s)": 1e3,
 }
 
 
@@ -683,6 +698,36 @@ def test_other_settings_of_nexus_are_warned_of(name, tmp_path):
         several = np.where(np.arange(len(KEYS)) < 9, own, other)
         with pytest.warns(UserWarning, match=f"views have several values of {name}"):
             opened(tomo(tmp_path / "3.nxs", **{place: several}), find_bad_pixels=False)
+
+
+ENERGIES = [
+    *(("8 keV", "8 KeV", False), ("8 keV", "8.0 keV", False), ("8 keV", "8.004 keV", False)),
+    *(("8 keV", "8.1 keV", True), ("8 keV", "8 MeV", True), ("8 meV", "8 MeV", True)),
+    *(("high", "High", False), ("high", "low", True)),
+]
+
+
+@pytest.mark.parametrize(("own", "other", "warned"), ENERGIES)
+def test_settings_in_other_words_are_the_same(own, other, warned, tmp_path):
+    views, flats = (
+        tomo(tmp_path / f"{k}.nxs", instrument__beam__incident_energy=text)
+        for k, text in enumerate((own, other))
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(views, flat=flats, find_bad_pixels=False)
+    found = ["has the instrument/beam/incident_energy" in str(one.message) for one in caught]
+    assert found == [True] * warned
+
+
+@pytest.mark.parametrize(("last", "warned"), [(8.001, False), (8.1, True)])
+def test_energies_that_differ_by_less_than_a_thousandth_are_not_warned_of(last, warned, tmp_path):
+    energies = np.linspace(8, last, len(KEYS))
+    views = tomo(tmp_path / "a.nxs", instrument__beam__incident_energy=energies)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(views, find_bad_pixels=False)
+    assert any("several values" in str(one.message) for one in caught) is warned
 
 
 @pytest.mark.parametrize("kind", ["S4", h5py.string_dtype()])

@@ -6,12 +6,14 @@ import gzip
 import struct
 import subprocess
 import sys
+import warnings
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections import rtk_images
 from tests.data.projections.conftest import opened
 
 needs_rtk = pytest.mark.skipif(find_spec("itk") is None, reason="itk-rtk is not installed")
@@ -234,7 +236,7 @@ EXPOSURES = {
 @pytest.mark.parametrize("case", EXPOSURES)
 def test_exposures_of_edf_are_applied_by_their_name(case, tmp_path):
     """A view of twice the exposure of the flat field has the integrals of the other; a time that is
-    no number is none.
+    no number is none, and is warned of.
     """
     name, stated = EXPOSURES[case]
     for k, light in enumerate((2, 1)):
@@ -244,7 +246,31 @@ def test_exposures_of_edf_are_applied_by_their_name(case, tmp_path):
         views = opened(tmp_path, exposure=name, find_bad_pixels=False).whole().views
     np.testing.assert_allclose(views[0], views[1], atol=1e-6)
     edf(tmp_path / "other.edf", grey(20_000)[0].astype("u2"), count_time="auto")
-    assert opened(tmp_path / "other.edf", flat=6e4).stack.exposure("ExposureTime") is None
+    with pytest.warns(UserWarning, match="other.edf: count_time: expected a number, got 'auto'"):
+        assert opened(tmp_path / "other.edf", flat=6e4).stack.exposure("ExposureTime") is None
+
+
+@pytest.mark.parametrize("text", ["-", "auto", "1e", "0.1.2", "nan"])
+def test_times_of_edf_that_are_no_numbers_are_warned_of(text, tmp_path):
+    path = tmp_path / "a.edf"
+    edf(path, grey(20_000)[0].astype("u2"), count_time=text, acq_expo_time=0.02)
+    with pytest.warns(UserWarning, match=f"a.edf: count_time: .*got '{text}'; it is not used"):
+        _, stated = rtk_images._check_edf(path)
+    assert stated == {"ExposureTime": ["20"]}
+
+
+@pytest.mark.parametrize(("step", "warned"), [(0.001, False), (0.02, True)])
+@needs_rtk
+def test_a_rings_current_that_decays_by_less_than_a_percent_is_not_warned_of(
+    step, warned, tmp_path
+):
+    for k in range(3):
+        current = {"counter_mne": "srcur", "counter_pos": f"{200 * (1 - k * step):g}"}
+        edf(tmp_path / f"view_{k}.edf", grey(20_000)[0].astype("u2"), **current)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(tmp_path, flat=6e4, find_bad_pixels=False)
+    assert any("several values of srcur" in str(one.message) for one in caught) is warned
 
 
 @needs_rtk

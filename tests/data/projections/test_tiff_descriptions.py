@@ -168,6 +168,57 @@ def test_times_and_bits_of_micro_manager_are_applied(tmp_path):
     assert measured.stack.top == 4095
 
 
+MANAGED = {
+    "no bits": ('"BitDepth": ""', "BitDepth: expected a number, got ''", 65535, None),
+    "bits of 0": ('"BitDepth": 0', "BitDepth from 1 to 16 bits, got 0", 65535, None),
+    "bits of others": ('"BitDepth": 17', "BitDepth from 1 to 16 bits, got 17", 65535, None),
+    "bits with words": ('"BitDepth": "16bit"', "BitDepth: .*got '16bit'", 65535, None),
+    "a comma": ('"Exposure-ms": "50,0"', "Exposure-ms: .*got '50,0'", 65535, None),
+    "infinite": ('"Exposure-ms": "inf"', "Exposure-ms: .*got 'inf'", 65535, None),
+    "property maps": (
+        '"BitDepth": {"PropType": "Integer", "PropVal": "12"}, '
+        '"Exposure-ms": {"PropType": "Double", "PropVal": 50.0}',
+        None,
+        4095,
+        50,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", MANAGED)
+def test_entries_of_micro_manager_that_cannot_be_read_are_warned_of(case, tmp_path):
+    entries, words, top, time = MANAGED[case]
+    tag = [(51123, "s", 0, f"{{{entries}}}", True)]
+    written(tmp_path / "a.tif", exposed()[0], extratags=tag)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        stack = open_projections(tmp_path / "a.tif")
+    texts = {str(one.message) for one in caught}
+    assert len(texts) == (words is not None)
+    assert all(re.search(f"a.tif: .*{words}.* it is not used", text) for text in texts)
+    assert stack.top == top
+    assert stack.exposure("ExposureTime") == (None if time is None else [time])
+
+
+@pytest.mark.parametrize(
+    ("times", "warned"), [((0.1, 0.0999998), False), ((49.99, 50.01), False), ((50, 51), True)]
+)
+def test_times_that_differ_by_less_than_a_percent_are_not_warned_of(times, warned, tmp_path):
+    pages = [(k, times[k % 2]) for k in range(4)]
+    path = ome(tmp_path / "a.tif", exposed(), planes(pages, "s"))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        open_projections(path)
+    found = ["several values of ExposureTime" in str(one.message) for one in caught]
+    assert found == [True] * warned
+
+
+def test_times_of_ome_that_are_no_numbers_are_warned_of(tmp_path):
+    path = ome(tmp_path / "a.tif", exposed(), planes([(0, "0,1")]))
+    with pytest.warns(UserWarning, match="a.tif: ExposureTime: expected a number, got '0,1'"):
+        assert open_projections(path).exposure("ExposureTime") is None
+
+
 DECTRIS = {
     "Detector:": "PILATUS 300K, S/N 3-0101",
     "Pixel_size": "172e-6 m x 172e-6 m",
@@ -217,6 +268,24 @@ def test_negative_pixels_of_dectris_are_bad_ones(flat, tmp_path):
     assert found.views.isfinite().all() and found.odd["floored"] == 0
     assert measured.stack.top == 133490
     assert measured.stack.pixel_mm == pytest.approx((0.172, 0.172))
+
+
+@pytest.mark.parametrize("kind", ["intensities", "counts"])
+def test_pixels_that_are_negative_in_single_views_are_left_out_of_these(kind, tmp_path):
+    """As where counts overflow, whatever the first view has; a pixel that is negative in all views
+    stays bad.
+    """
+    values = pilatus_scan(tmp_path / "a")
+    for k, value in ((1, -2), (3, -1)):
+        values[k, 3, 3] = value
+        pilatus(tmp_path / f"a/view_{k}.tif", values[k])
+    with pytest.warns(UserWarning, match="2 pixels of 4 views are negative, which marks bad ones"):
+        found = opened(tmp_path / "a", kind=kind, find_bad_pixels=False).whole()
+    assert torch.equal(found.mask, torch.from_numpy(values >= 0))
+    near = (values[1, [2, 4, 3, 3], [3, 3, 2, 4]] / FLAT).mean()
+    expected = -np.log(near) if kind == "intensities" else FLAT * near
+    assert found.views[1, 3, 3] == pytest.approx(expected, rel=1e-4)
+    assert found.odd["floored"] == 0
 
 
 def test_fewer_negative_pixels_than_dectris_states_are_warned_of(tmp_path):
@@ -277,6 +346,37 @@ def test_images_of_several_cutoffs_have_no_saturation_until_it_is_given(tmp_path
     pilatus_scan(tmp_path / "a", entries)
     with pytest.raises(Refused, match="one greatest grey value.*give saturation="):
         opened(tmp_path / "a")
+
+
+UNREAD = {
+    "Exposure_time": ("unknown", "0,02 s"),
+    "Count_cutoff": ("unknown", "10,48 counts"),
+    "Filter_transmission": ("none",),
+    "Pixel_size": ("172e-6 m", "172 x 172 pixels"),
+    "N_excluded_pixels": ("none",),
+}
+
+
+@pytest.mark.parametrize(("name", "text"), [(n, text) for n, own in UNREAD.items() for text in own])
+def test_entries_of_dectris_that_cannot_be_read_are_warned_of(name, text, tmp_path):
+    pilatus(tmp_path / "a.tif", exposed()[0], **{name: text})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        stack = open_projections(tmp_path / "a.tif")
+    (words,) = {str(one.message) for one in caught}
+    assert re.search("a.tif: expected .*; it is not used", words)
+    assert stack.exposure("ExposureTime") == (None if name == "Exposure_time" else [20])
+    assert stack.top == (2**31 - 1 if name == "Count_cutoff" else 133490)
+
+
+@pytest.mark.parametrize(
+    ("text", "top"), [("-1", 2**31 - 1), ("0 counts", 2**31 - 1), ("1,048,574 counts", 1048574)]
+)
+def test_cutoffs_of_dectris_with_commas_or_of_none_are_read(text, top, tmp_path):
+    pilatus(tmp_path / "a.tif", exposed()[0], Count_cutoff=text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert open_projections(tmp_path / "a.tif").top == top
 
 
 def test_a_text_of_other_programs_with_such_words_is_none_of_dectris(tmp_path):
