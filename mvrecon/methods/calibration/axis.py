@@ -80,7 +80,8 @@ def refined_axis(
         most_px: greatest shift in pixels.
 
     Warns:
-        UserWarning: the slice's views are most consistent with a greater shift; it is 0.
+        UserWarning: the slice's views are most consistent with a greater shift; it is 0, with that
+            shift as its uncertainty.
     """
     try:
         orbit = orbit_of(cameras, grid)
@@ -109,10 +110,11 @@ def refined_axis(
         if abs(offset) > most_px:
             warnings.warn(
                 f"The views of one slice shift the axis by {offset:.3g} pixels, expected at most "
-                f"{most_px:.3g} by the fit to all views: it is not refined on the slice",
+                f"{most_px:.3g} by the fit to all views: it is not refined on the slice, and "
+                f"uncertain by as much",
                 stacklevel=2,
             )
-            return Axis(0.0, math.inf)
+            return Axis(0.0, abs(offset))
         rig = rig.shifted(columns * rig.source.new_tensor([[change, 0.0]]))
     return Axis(offset, uncertainty)
 
