@@ -228,12 +228,14 @@ def test_places_that_agree_are_applied_once(case, tmp_path):
     (*DICOM, *BEAM, *CAMERA_PLACES),
 )
 def test_views_of_several_exposures_are_warned_of(name, tmp_path):
-    """In each of DICOM's units, in files of their own as in the functional groups of frames."""
+    """In each of DICOM's units, in files of their own as in the functional groups of frames, where
+    they differ by more than 1 %.
+    """
     kind = str if dictionary_VR(name) in ("CS", "LO", "LT", "SH", "ST") else int
     for k in range(3):
-        tags = {"InstanceNumber": k, name: kind(100 + k // 2)}
+        tags = {"InstanceNumber": k, name: kind(100 + 2 * (k // 2))}
         dicom_image(tmp_path / f"{k}.dcm", grey()[k], **tags)
-    with pytest.warns(UserWarning, match=f"views have several values of {name}, 100.* or 101"):
+    with pytest.warns(UserWarning, match=f"views have several values of {name}, 100.* or 102"):
         open_projections(tmp_path)
 
 
