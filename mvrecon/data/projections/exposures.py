@@ -155,6 +155,11 @@ def exposure_names(views: ProjectionStack, exposure: str | Path | None) -> list[
     return names if names and views.exposure(*names) is not None else []
 
 
+def _values_of(texts: Iterable[str]) -> set[str]:
+    """All values of an attribute in texts of views; "" of none, several joined by " or "."""
+    return {word for text in texts for word in text.split(" or ")} - {""}
+
+
 def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "") -> None:
     """Warn of views that state several values of an attribute, but for numbers that differ by no
     more than counts.
@@ -165,7 +170,7 @@ def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "")
         texts: of each view; "" of none, several joined by " or ".
         cure: what to do; by default, that of exposure and beam.
     """
-    stated = {word for text in texts for word in text.split(" or ")} - {""}
+    stated = _values_of(texts)
     own = "" if kind_of(name) == "beam" else f"{name} or "
     default = not cure  # others are places, of which every difference counts
     cure = cure or (
@@ -335,10 +340,7 @@ def warn_of_others(
         if (name == "dark" and kind != "time") or (name == "flat" and applied and kind != "beam"):
             continue
         if kind == "beam":
-            sets = [
-                {word for text in one for word in text.split(" or ")} - {""}
-                for one in (texts, field.stated.get(key, ()))
-            ]
+            sets = [_values_of(one) for one in (texts, field.stated.get(key, ()))]
             own, other = (" or ".join(sorted(one)[:3]) for one in sets)
             same = not own or not other or _same_beam(key, *sets)
         else:

@@ -31,9 +31,8 @@ BEAM = (
 )
 #: Single numbers of a detector.
 NUMBERS = ("saturation_value", "underload_value")
-#: The type of numbers, and a number as text, with its unit.
+#: The type of numbers.
 NUMERIC = re.compile(r"(u?int|float|bool)\d*")
-NUMBER = re.compile(r"([-+.\d]+(?:[eE][-+]?\d+)?)\s*(\D*)")
 KEYS = (
     Key("pixel_mask", "applied", "bad pixels, all but 0; another size is warned of"),
     Key("saturation_value", "applied", "the greatest grey value, where positive"),
@@ -94,7 +93,7 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
         Refused: an exposure that is no number, or many texts.
     """
     text = texts_at([place], "", EXPECTED).get(place, "").strip()  # or the type of numbers
-    beam, number = exposures.kind_of(name) == "beam", NUMBER.fullmatch(text)
+    beam, number = exposures.kind_of(name) == "beam", exposures.NUMBER.fullmatch(text)
     if beam and not NUMERIC.fullmatch(text):
         if re.fullmatch(r"object|\|S\d+", text):  # texts of each frame
             raise Refused(f"{place}: expected one {name} of all frames, got many texts")

@@ -56,13 +56,12 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     number = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}{number}"
     files, parts, keys = _sorted(paths, number)
     for other in (EXPONENT, COMMA):
-        if _sorted(paths, f"{other}|{number}")[0] != files:
-            such = next(
-                found[0] for path in files if (found := re.search(other, path.stem.lower()))
-            )
+        found = filter(None, (re.search(other, path.stem.lower()) for path in files))
+        such = next(found, None)
+        if such and _sorted(paths, f"{other}|{number}")[0] != files:
             raise Refused(
-                f"{where}: expected names whose numbers can be read in one way, got {such}, which "
-                f"may be one number or two, in another order; rename the files"
+                f"{where}: expected names whose numbers can be read in one way, got {such[0]}, "
+                f"which may be one number or two, in another order; rename the files"
             )
     columns = zip(*(part[1::2] for part in parts.values()), strict=False)
     if any(len({*texts}) > 1 and all(text[0] == "-" for text in texts) for texts in columns):

@@ -26,7 +26,6 @@ from mvrecon.methods.classical.truncation import (
     ROW_BLOCKS,
     continuation,
     edges_of,
-    ends_of,
     reach_rows,
     truncated,
     warn_of_truncation,
@@ -330,10 +329,12 @@ def filtered_backprojection(
         check_floating(views, "views")
         near = _known(cameras, grid, filtering, views, lambda to=views.device: plan.to(to))
         images = near.images._replace(maps=near.images.maps[part])
-        filtered, sides = near.filtered(to_accumulation_dtype(views), part)
+        views = to_accumulation_dtype(views)
+        filtered, sides = near.filtered(views, part)
         edges.append(sides)
-        if plan.beyond_rows and views.is_cpu:
-            ends.append(ends_of(to_accumulation_dtype(views.detach())))
+        # all that a single row sees extends beyond it, and a GPU would have to be waited for
+        if plan.beyond_rows and cameras.shape[0] > 1 and views.is_cpu:
+            ends.append(edges_of(views.detach().mT))
         if total is None:
             total = backproject_images(filtered, images, weighted=True)
         elif torch.is_grad_enabled():
@@ -343,9 +344,7 @@ def filtered_backprojection(
     assert total is not None  # a rig has at least one camera
     if edges[0].is_cpu:  # a GPU would have to be waited for
         warn_of_truncation(torch.cat(edges, dim=2), filtering.extrapolate)
-    # all that a single row sees extends beyond it, and a GPU would have to be waited for
-    known = ends and cameras.shape[0] > 1
-    if plan.beyond_rows and (not known or reach_rows(torch.cat(ends, dim=2))):
+    if plan.beyond_rows and (not ends or reach_rows(torch.cat(ends, dim=2))):
         warnings.warn(plan.beyond_rows, stacklevel=2)
     return total
 

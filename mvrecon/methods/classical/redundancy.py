@@ -233,9 +233,10 @@ class _Branches:
         count = max(MIN_ANGLES, ANGLES_PER_VIEW * len(angles))
         step = FULL_TURN / count
         places = (torch.arange(count, dtype=torch.float64) + 0.5) * step
-        usual = _usual(_gaps(angles))
+        gaps = _gaps(angles)
+        usual = _usual(gaps)
         most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
-        named = min(most, min(usual, _even(_gaps(angles))) + NAMED_GAP)
+        named = min(most, min(usual, _even(gaps)) + NAMED_GAP)
         measured, near = (
             _covered(angles, places, edge > 0, gap, min(usual, gap)) for gap in (most, named)
         )

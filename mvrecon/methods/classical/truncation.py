@@ -112,11 +112,14 @@ def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
     return edge_shares(ends_of(views)) > CUT_EDGE
 
 
-def reach_rows(ends: Float[Tensor, "b c m 2 10 i"]) -> bool:
+def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
     """Whether an object reaches the first or the last row of any view: a mean over a block of its
     columns is above noise and above what air reads, which is the lowest of these means.
+
+    Args:
+        edges: edges of the views' columns, `edges_of(views.mT)`.
     """
-    edges, _, _, level, _, noise = ends[:, :, :, 0].split(PARTS, dim=-2)
+    edges, _, _, level, _, noise = edges.split(PARTS, dim=-2)
     top, lowest = level.amax(dim=(2, 3, 4), keepdim=True), edges.amin(dim=(2, 3, 4), keepdim=True)
     air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
     return bool((edges - air > ROW_EDGE * top + ROW_DEVIATIONS * noise).any())
