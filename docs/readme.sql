@@ -5,11 +5,9 @@ with cpu as (
   where own.views = 32 and own.part = 'drr' and own.method = 'joseph' and own.backend = 'cpu' and own.options not like '%rays_per_pixel%'
 ),
 gpu as (
-  select own.[case], nano.forward_ms / own.forward_ms as forward, nano.adjoint_ms / own.adjoint_ms as adjoint,
-    astra.adjoint_ms / own.adjoint_ms as astra, nano.pose_ms / own.pose_ms as pose
+  select own.[case], nano.forward_ms / own.forward_ms as forward, nano.adjoint_ms / own.adjoint_ms as adjoint
   from [experiments/23_gpu/operators.csv] own
   join [experiments/23_gpu/operators.csv] nano on nano.[case] = own.[case] and nano.volumes = 1 and nano.program = 'nanodrr n samples'
-  join [experiments/23_gpu/operators.csv] astra on astra.[case] = own.[case] and astra.volumes = 1 and astra.program = 'astra cuda'
   where own.volumes = 1 and own.program = 'mvrecon joseph'
 ),
 measured as (select * from [experiments/21_faults/unaligned.csv]),
@@ -19,25 +17,29 @@ patients as (
   where own.method = 'cross_view' and unet.method = 'world_unet'
 ),
 spect as (
-  select own.seed, own.steps, avg(own.psnr - unet.psnr) as lead
-  from [experiments/22_dcspect/cases.csv] own join [experiments/22_dcspect/cases.csv] unet
-  on unet.[case] = own.[case] and unet.seed = own.seed and unet.steps between own.steps and 1.3 * own.steps
-  where own.method = 'cross_view' and unet.method = 'world_unet' and own.faults = 'all' and unet.faults = 'all'
-  group by own.seed, own.steps
+  select own.psnr - unet.psnr as lead, own.heart_nrmse - unet.heart_nrmse as heart
+  from [experiments/22_dcspect/cases_footprints.csv] own join [experiments/22_dcspect/cases_footprints.csv] unet on unet.[case] = own.[case]
+  where own.method = 'cross_view' and unet.method = 'world_unet'
+),
+corrupted as (
+  select method, avg(psnr) as psnr from [experiments/29_ray_weights/classical.csv] where faults like '%rod%' group by method
+),
+starts as (
+  select views, avg(seconds) as seconds, count(*) as count, sum(degrees < 1 and mm < 1) as found
+  from [experiments/31_registration/starts.csv] where part = 'mvrecon' group by views
 )
 select
   (select printf('%.1f to %.1f times (forward) and %.1f to %.1f times (adjoint) as fast as RTK',
     min(forward), max(forward), min(adjoint), max(adjoint)) from cpu),
-  (select printf('%.1f and %.1f times as fast as nanodrr with 128 samples per ray; the adjoint is %.1f times as fast as ASTRA''s',
-    forward, adjoint, astra) from gpu where [case] = '128:32:128'),
-  (select iif(pose < 1, 'At 64^3 voxels, nanodrr''s pose gradient is faster', null) from gpu where [case] = '64:8:96'),
+  (select printf('%.1f and %.1f times as fast as nanodrr with 128 samples per ray', forward, adjoint) from gpu where [case] = '128:32:128'),
+  (select printf('`robust_sirt` is %.1f dB ahead of SIRT', (select psnr from corrupted where method = 'robust_sirt') - psnr)
+    from corrupted where method = 'sirt'),
+  (select printf('in %d of %d starts, within 1 to 2 s', found, count) from starts where views = 1 and seconds between 1 and 2),
   printf('from %.1f to %.1f dB', (select avg(psnr) from measured where method = 'sirt'), (select avg(psnr) from aligned where method = 'sirt')),
-  (select printf('at %.2f pixels (stated: 6.125', [columns aside]) from [experiments/25_measured/axis.csv] where [by] = 'calibrate=[offset_u]'),
+  (select printf('at %.2f pixels (its authors: 6.125', [columns aside]) from [experiments/25_measured/axis.csv] where [by] = 'calibrate=[offset_u]'),
   printf('is %.1f dB behind cross-view with camera weights and reweighted SIRT',
     (select avg(psnr) from measured where method = 'cross_view, reweight=12' and seed = 0 and steps = 1000)
     - (select avg(psnr) from measured where method = 'world_unet' and steps = 4400)),
   (select printf('leads by %.2f +- %.2f dB', avg(lead), 2 * stdev(lead) / sqrt(count(lead))) from patients),
-  (select printf('leads by %.1f to %.1f dB with 16 pinholes', min(lead), max(lead)) from spect),
-  printf('it is %.2f dB behind',
-    (select avg(psnr) from [experiments/22_dcspect/cases_80.csv] where method = 'world_unet' and steps = 650)
-    - (select avg(psnr) from [experiments/22_dcspect/cases_80.csv] where method = 'cross_view' and steps = 500))
+  (select printf('cross-view %+.2f +- %.2f dB, but a larger error in the heart', avg(lead), 2 * stdev(lead) / sqrt(count(lead)))
+    from spect having avg(heart) > 0)

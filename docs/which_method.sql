@@ -10,7 +10,7 @@ with rows as (
   union all select 'rods, scatter, dead columns', method, seed, [case], psnr from [experiments/29_ray_weights/networks.csv] where faults like '%rod%' and method not like '%earlier loss'
   union all select 'rods, scatter, dead columns', method, seed, [case], psnr from [experiments/29_ray_weights/classical.csv] where faults like '%rod%' and method != 'robust_48'
 )
-select a.views, a.method, count(distinct a.seed) as seeds, printf('%.1f', avg(a.psnr)) as [PSNR dB],
+select a.views, a.method, iif(a.method in ('sirt', 'fista_tv', 'robust_sirt'), '', count(distinct a.seed)) as seeds, printf('%.1f', avg(a.psnr)) as [PSNR dB],
   printf('%+.1f', avg(a.psnr - s.psnr)) as [over SIRT, dB], printf('%.1f', 2 * stdev(a.psnr - s.psnr) / sqrt(33)) as [+-],
   case when a.method = 'fista_tv' or t.psnr is null then '' else printf('%+.1f', avg(a.psnr - t.psnr)) end as [over FISTA-TV, dB]
 from rows a

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Register a CT to two X-ray views
 #
-# Where is the patient? A CT is known, and so is the C-arm; two X-ray views show the patient turned and shifted by an unknown rigid
-# motion. Six numbers are found by gradient descent through `mv.Drr`, whose views are differentiable in the pose of the cameras.
+# A CT is known, and so is the C-arm; two X-ray views show the object turned and shifted by an unknown rigid motion. Here the CT is a
+# phantom of ellipsoids. Six numbers are found by gradient descent through `mv.Drr`, whose views are differentiable in the pose of the cameras.
 
 # %%
 import torch
@@ -63,7 +63,7 @@ def register(ct: torch.Tensor, views: torch.Tensor, steps: int = 40) -> torch.Te
 
 
 # %% [markdown]
-# ## Eight patients out of place
+# ## Eight poses
 #
 # Up to 15 degrees about and 20 mm along each axis. The views are the closed-form integrals of the object, not projections of the CT by
 # the same operator. The error of the position is at the centre of the CT.
