@@ -11,15 +11,11 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from decimal import Decimal
-from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.files.keys import Key, check_keys
@@ -189,8 +185,7 @@ class ImageFiles(ProjectionStack):
         for name, texts in self.stated.items():
             cure = "which the camera must have" if name in CAMERA_PLACES else ""
             exposures.warn_of_several(files[0].parent, name, texts, cure)
-        self.files, self._excluded = list(files), headers[0].excluded
-        self.negative_is_bad = self._excluded is not None
+        self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm, self._tops = (
             headers[0].pixel_mm,
             frozenset().union(*(head.tops for head in headers)),
@@ -220,24 +215,6 @@ class ImageFiles(ProjectionStack):
                 f"RescaleSlope; give saturation=<grey value> (views.saturation)"
             )
         return next(iter(self._tops))
-
-    @cached_property
-    def marked(self) -> Bool[Tensor, "v u"] | None:
-        """Negative pixels of the first view, where these are no counts.
-
-        Warns:
-            UserWarning: the file states more.
-        """
-        if self._excluded is None:
-            return None
-        marked = torch.from_numpy(self._block(0, 1)[0] < 0)
-        if marked.sum() < self._excluded:
-            warnings.warn(
-                f"{self.path}: expected as many negative pixels as N_excluded_pixels states, "
-                f"{self._excluded}, got {int(marked.sum())}; give the others as views.bad_pixels",
-                stacklevel=2,
-            )
-        return marked
 
     def _block(self, first: int, last: int) -> np.ndarray:
         if len(self.files) == 1:

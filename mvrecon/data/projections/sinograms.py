@@ -30,7 +30,7 @@ class Sinograms(ProjectionStack):
             for name, field in slices.fields.items()
         }
         self.rig, self.mirrored = slices.rig, slices.mirrored
-        self.negative_is_bad = slices.negative_is_bad
+        self.excluded = None if slices.excluded is None else 0
 
     @property
     def top(self) -> float | None:

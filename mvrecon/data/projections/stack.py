@@ -4,6 +4,7 @@ cameras alike.
 """
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
@@ -96,8 +97,9 @@ class ProjectionStack(ABC):
     affine: np.ndarray | None = None
     #: Whether views, and fields beside them, are stored as seen from the detector's back.
     mirrored: bool = False
-    #: Whether negative values mark pixels that a view could not measure.
-    negative_is_bad: bool = False
+    #: Where negative values mark pixels that a view could not measure: the number of those that the
+    #: files state for all views.
+    excluded: int | None = None
     #: Flat and dark fields that the file itself has, by "flat" and "dark".
     fields: Mapping[str, "ProjectionStack | float"] = {}
     #: Exposure, beam and places that the files state, by name: a text for each view, "" of none.
@@ -135,8 +137,22 @@ class ProjectionStack(ABC):
 
     @property
     def marked(self) -> Bool[Tensor, "v u"] | None:
-        """Pixels that the files mark as bad; None if they mark none."""
-        return None
+        """Pixels that the files mark as bad in all views: those that are negative in the first;
+        None if they mark none.
+
+        Warns:
+            UserWarning: the files state more.
+        """
+        if self.excluded is None:
+            return None
+        marked = self.read(0, 1)[0] < 0
+        if marked.sum() < self.excluded:
+            warnings.warn(
+                f"{self.path}: expected as many negative pixels as N_excluded_pixels states, "
+                f"{self.excluded}, got {int(marked.sum())}; give the others as views.bad_pixels",
+                stacklevel=2,
+            )
+        return marked
 
     def exposure(self, *names: str) -> Float[np.ndarray, " m"] | None:
         """The product of what files state of each view by names; None unless all are numbers."""

@@ -376,7 +376,8 @@ class MeasuredViews:
             few = self._few
             bright = (zingers(light.swapaxes(0, 1)).swapaxes(0, 1) if few else zingers(light))[kept]
         raw, values = raw[kept], values[kept]
-        unread = (raw < 0) & ~bad if self.stack.negative_is_bad else torch.zeros_like(bright)
+        marks = self.stack.excluded is not None
+        unread = (raw < 0) & ~bad if marks else torch.zeros_like(bright)
         lost = bright | unread
         for k in lost.flatten(1).any(dim=1).nonzero().flatten().tolist():
             values[k] = filled(values[k : k + 1], bad | lost[k])[0]
