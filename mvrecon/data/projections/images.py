@@ -1,28 +1,25 @@
 """Projections as images: a folder of TIFF, PNG, DICOM or RTK's files, or one file of several pages.
 
-Pillow reads PNG; for TIFF see `mvrecon.data.projections.tiff`, for RTK's formats `rtk_images`.
+For TIFF see `mvrecon.data.projections.tiff`, for PNG `png`, for RTK's formats `rtk_images`.
 """
 
 import re
-import struct
 import warnings
-import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from decimal import Decimal
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.checks import Refused, check_file, file_errors, shown
+from mvrecon.core.files.keys import Key
 from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures, rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
+from mvrecon.data.projections.png import png_header, png_pages
 from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
 from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
@@ -30,22 +27,6 @@ from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", **rtk_images.ENDINGS}
 #: Files below a folder without images that are looked at, to name the folder that has some.
 LOOKED_AT = 1000
-#: Pixel types of a grey PNG by Pillow's mode.
-MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
-#: Tag of EXIF for the order of rows and columns.
-ORIENTATION = 274
-#: Chunks and fields of PNG that change the pixels.
-PNG_KEYS = (
-    Key("bit depth", "refused", "Pillow rescales fewer bits", (8, 16)),
-    Key("colour type", "refused", "grey values", (0,)),
-    Key("interlace method", "applied"),
-    Key("acTL", "refused", "one image in each file"),
-    Key("pCAL", "refused", "store the values that the calibration gives"),
-    Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
-    Key("gAMA, sRGB, iCCP, cICP, cHRM, tRNS", "ignored", "display alone"),
-    Key("pHYs, oFFs, sCAL", "ignored", "origin and print size"),
-    Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
-)
 #: Attributes of DICOM projections that all views have in common.
 ALIKE = (
     "FieldOfViewOrigin",
@@ -123,19 +104,6 @@ DICOM_KEYS = (
         "ignored",
         "the camera decides",
     ),
-)
-#: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
-PLAIN, INTERLACED = (
-    [(0, 0, 1, 1)],
-    [
-        (0, 0, 8, 8),
-        (4, 0, 8, 8),
-        (0, 4, 4, 8),
-        (2, 0, 4, 4),
-        (0, 2, 2, 4),
-        (1, 0, 2, 2),
-        (0, 1, 1, 2),
-    ],
 )
 #: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001; the
 #: ESRF has refHST0000.edf, dark.edf, and darkend0000.edf, a sum of images, which is no field.
@@ -401,66 +369,7 @@ def _dicom_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     yield from values.reshape(-1, *values.shape[-2:])[first:last]
 
 
-def _png_header(file: Path) -> Header:
-    with _png(file) as image:
-        columns, rows = image.size
-        with file.open("rb") as raw:
-            bits, colours = struct.unpack_from("BB", raw.read(26), 24)
-        chunks = dict.fromkeys((name for name, _ in _chunks(file)), "one")
-        stated = {"bit depth": bits, "colour type": colours, **chunks}
-        stated["eXIf: Orientation"] = image.getexif().get(ORIENTATION) if "eXIf" in chunks else None
-        check_keys(file, PNG_KEYS, stated.get)
-        kind = MODES.get(image.mode)
-        if kind is None or max(rows, columns) > EDGE:
-            raise Refused(
-                f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got {rows} x "
-                f"{columns} of the type {image.mode}"
-            )
-        return Header((rows, columns), np.dtype(kind), 1, frozenset([2.0**bits - 1]))
-
-
-def _png_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
-    _check_rows(file)
-    with _png(file) as image:
-        yield np.asarray(image).astype(MODES[image.mode], copy=False)
-
-
-def _check_rows(file: Path) -> None:
-    """Raise for a truncated grey PNG: Pillow leaves missing rows zero."""
-    data = file.read_bytes()
-    columns, rows, bits, interlaced = struct.unpack_from(">IIB3xB", data, 16)
-    sizes = [
-        (len(range(y, rows, down)), len(range(x, columns, right)))
-        for x, y, right, down in (INTERLACED if interlaced else PLAIN)
-    ]
-    needed = sum(m * (1 + (n * bits + 7) // 8) for m, n in sizes if n)  # a byte before each row
-    stream, got = zlib.decompressobj(), 0
-    for name, part in _chunks(file):
-        if name == "IDAT" and got < needed:
-            got += len(stream.decompress(data[part], needed - got))
-    if got < needed:
-        raise Refused(f"{file}: expected {needed} bytes of {rows} x {columns} pixels, got {got}")
-
-
-def _chunks(file: Path) -> Iterator[tuple[str, slice]]:
-    """Names of the chunks of a PNG, and the bytes of their contents."""
-    with file.open("rb") as raw:
-        raw.seek(8)
-        while len(head := raw.read(8)) == 8:
-            size, name = struct.unpack(">I4s", head)
-            yield name.decode("latin-1"), slice(raw.tell(), raw.tell() + size)
-            raw.seek(size + 4, 1)
-
-
-@contextmanager
-def _png(file: Path) -> Iterator[Any]:
-    from PIL import Image as Pillow
-
-    with Pillow.open(file, formats=["PNG"]) as image:
-        yield image
-
-
 RTK = rtk_images.ENDINGS.values()
 #: Readers of a header and of pages by format; those of others are DICOM's.
-HEADERS = {"TIFF": tiff_header, "PNG": _png_header, **dict.fromkeys(RTK, rtk_images.rtk_header)}
-PAGES = {"TIFF": tiff_pages, "PNG": _png_pages, **dict.fromkeys(RTK, rtk_images.rtk_pages)}
+HEADERS = {"TIFF": tiff_header, "PNG": png_header, **dict.fromkeys(RTK, rtk_images.rtk_header)}
+PAGES = {"TIFF": tiff_pages, "PNG": png_pages, **dict.fromkeys(RTK, rtk_images.rtk_pages)}

@@ -13,9 +13,9 @@ from PIL import Image as Pillow
 
 from mvrecon.core import machine as memory
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.images import INTERLACED, PLAIN
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.ordering import ordered
+from mvrecon.data.projections.png import INTERLACED, PLAIN
 from mvrecon.data.volume_files import read_volume
 from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
 
