@@ -4,6 +4,8 @@
 
 import math
 import re
+from collections.abc import Mapping, Sequence
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 from mvrecon.core.files.checks import Refused, millimetres, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
-from mvrecon.data.projections.stack import Header
+from mvrecon.data.projections.stack import Header, PlaceInSet
 
 #: OME's types of pixels.
 TYPES = {f"int{bits}": f"i{bits // 8}" for bits in (8, 16, 32)}
@@ -70,17 +72,43 @@ QUOTED = re.compile(
     r".*?</(?:\w+:)?\1\s*>",
     re.DOTALL,
 )
+#: An element of OME's description that says which page of a file is which image.
+PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
 #: A comma between thousands.
 THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
-def elements(text: str, name: str) -> list[dict[str, str]]:
-    """The attributes of each element of OME's description of a name; none of other texts."""
+def images(text: str) -> list[str]:
+    """OME's description up to the first image, and from each one to the next; none of other
+    texts.
+    """
     text = QUOTED.sub("", text)
-    found = re.findall(rf"<(?:\w+:)?{name}\b([^>]*)>", text) if OME.search(text) else []
-    return [dict(ATTRIBUTE.findall(attributes)) for attributes in found]
+    return re.split(r"<(?:\w+:)?Image\b", text) if OME.search(text) else []
+
+
+def elements(parts: Sequence[str], name: str) -> list[dict[str, str]]:
+    """The attributes of each element of a name in parts of OME's description."""
+    found = [re.findall(rf"<(?:\w+:)?{name}\b([^>]*)>", part) for part in parts]
+    return [dict(ATTRIBUTE.findall(attributes)) for of_part in found for attributes in of_part]
+
+
+def places_in_set(text: str) -> dict[str, list[PlaceInSet]]:
+    """Where OME places the pages of the files of a set, by the names of these; empty where it names
+    fewer than two files.
+    """
+    pages: dict[str, list[tuple[int, PlaceInSet]]] = {}
+    for number, image in enumerate(images(text)):
+        for attributes, inside in PLACED.findall(image):
+            own, name = (dict(ATTRIBUTE.findall(part)) for part in (attributes, inside))
+            if "FileName" in name:
+                place = (number, *(int(own.get(f"First{axis}", 0)) for axis in "CZT"))
+                page = int(own.get("IFD", 0)), place
+                pages.setdefault(unescape(name["FileName"]), []).append(page)
+    if len(pages) < 2:
+        return {}
+    return {name: [place for _, place in sorted(those)] for name, those in pages.items()}
 
 
 def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
@@ -140,19 +168,23 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
     return head._replace(stated=stated)
 
 
-def of_file(file: Path, head: Header, text: str) -> Header:
+def of_file(
+    file: Path, head: Header, text: str, places: Mapping[str, Sequence[PlaceInSet]]
+) -> Header:
     """The header of all pages, in the order of the images, with what OME states of them.
 
     Args:
-        file: for messages.
+        file: whose name is that of a file of the set.
         head: by the pages.
         text: the description of the first page.
+        places: those in a set of files, see `places_in_set`.
 
     Raises:
         Refused: another type of pixels than it states, or more bits than they have.
     """
     stated = {name: list(texts) for name, texts in head.stated.items()}
-    for pixels in elements(text, "Pixels"):
+    parts = images(text)
+    for pixels in elements(parts, "Pixels"):
         kind = pixels.get("Type", "")
         if np.dtype(TYPES.get(kind, head.dtype)) != head.dtype.newbyteorder("="):
             raise Refused(f"{file}: expected pixels of OME's Type {kind}, got {head.dtype}")
@@ -160,11 +192,14 @@ def of_file(file: Path, head: Header, text: str) -> Header:
             head = head._replace(tops=_tops(file, "SignificantBits", bits, head))
     for name, keys in OME_BEAM.items():
         for key in keys:
-            found = sorted({one[key] for one in elements(text, name) if key in one})
+            found = sorted({one[key] for one in elements(parts, name) if key in one})
             for page in range(head.pages if found else 0):
                 _add(stated, f"{name} {key}", page, " or ".join(found), head.pages)
-    for plane in elements(text, "Plane"):
-        page = sum(int(plane.get(f"The{axis}", 0)) for axis in "ZCT")  # one of them runs
+    own = {place: page for page, place in enumerate(places.get(file.name, ()))}
+    planes = ((number, p) for number, i in enumerate(parts) for p in elements([i], "Plane"))
+    for number, plane in planes:
+        place = (number, *(int(plane.get(f"The{axis}", 0)) for axis in "CZT"))
+        page = own.get(place, head.pages) if own else sum(place[1:])  # one of them runs
         if "ExposureTime" in plane and page < head.pages:
             unit = plane.get("ExposureTimeUnit", "s")
             if (time := number_of(plane["ExposureTime"], f"{file}: ExposureTime")) is not None:

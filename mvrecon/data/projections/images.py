@@ -6,9 +6,9 @@ For TIFF see `mvrecon.data.projections.tiff`, for PNG `png`, for RTK's formats `
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures, rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.png import png_header, png_pages
-from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
+from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet, ProjectionStack
 from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
 #: Formats of image files by their ending; others may be DICOM.
@@ -114,10 +114,10 @@ FIELDS = {
 
 
 class ImageFiles(ProjectionStack):
-    """Views as images, one in each file, or all in one file of several pages.
+    """Views as images, one in each file, or all in one file of several pages, or in those of a set.
 
     Args:
-        files: the views' files, in their order.
+        files: the views' files, in their order; those of a set have its own.
 
     Raises:
         Refused: images of several sizes or types, colours, a file that is damaged, or one with a
@@ -131,8 +131,13 @@ class ImageFiles(ProjectionStack):
                 raise Refused(
                     f"{file}: expected {headers[0].words} as {files[0].name}, got {other.words}"
                 )
-            if len(files) > 1 and other.pages > 1:
+            if len(files) > 1 and other.pages > 1 and not other.places:
                 raise Refused(f"{file}: expected one image in each file, got {other.pages}")
+            if len(files) > 1 and other.places != headers[0].places:
+                raise Refused(
+                    f"{file}: expected files of one set by OME's description, as {files[0].name} "
+                    f"is, got another; choose by pattern=... (views.pattern)"
+                )
             if other.pixel_mm != headers[0].pixel_mm:
                 raise Refused(
                     f"{file}: expected the ImagerPixelSpacing {headers[0].pixel_mm} of "
@@ -144,12 +149,13 @@ class ImageFiles(ProjectionStack):
                         f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
-        self.stated = {
-            name: [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
-            for name in dict.fromkeys(
-                (*COMPARED, *(key for head in headers for key in head.stated))
-            )
-        }
+        where = files[0] if len(files) == 1 else files[0].parent
+        pages = [(f, k) for f, head in zip(files, headers, strict=True) for k in range(head.pages)]
+        order = _order_of(where, headers[0].places, pages)
+        self.stated = {}
+        for name in dict.fromkeys((*COMPARED, *(key for head in headers for key in head.stated))):
+            own = [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
+            self.stated[name] = [own[k] for k in order]
         for name, texts in self.stated.items():
             cure = "which the camera must have" if name in CAMERA_PLACES else ""
             exposures.warn_of_several(files[0].parent, name, texts, cure)
@@ -164,10 +170,10 @@ class ImageFiles(ProjectionStack):
         }
         if all(head.linear for head in headers):
             self.kind = "intensities"
-        single = len(files) == 1
-        names = [f"{files[0].stem} {k}" for k in range(headers[0].pages)] if single else []
-        names = names if len(names) > 1 else [file.stem for file in files]
-        super().__init__(files[0] if single else files[0].parent, names, *headers[0][:2])
+        self._pages = [pages[k] for k in order]
+        alone = {file for file, head in zip(files, headers, strict=True) if head.pages == 1}
+        names = [f.stem if f in alone else f"{f.stem} {k}" for f, k in self._pages]
+        super().__init__(where, names, *headers[0][:2])
 
     @property
     def top(self) -> float | None:
@@ -185,16 +191,38 @@ class ImageFiles(ProjectionStack):
         return next(iter(self._tops))
 
     def _block(self, first: int, last: int) -> np.ndarray:
-        if len(self.files) == 1:
-            return np.stack(list(_pages(self.files[0], first, last)))
-        return np.stack([next(_pages(file, 0, 1)) for file in self.files[first:last]])
+        found: list[np.ndarray] = []
+        pages = enumerate(self._pages[first:last])
+        for (file, _), run in groupby(pages, key=lambda one: (one[1][0], one[1][1] - one[0])):
+            numbers = [page for _, (_, page) in run]  # one after the other
+            found += _pages(file, numbers[0], numbers[-1] + 1)
+        return np.stack(found)
+
+
+def _order_of(
+    where: Path, places: Mapping[str, Sequence[PlaceInSet]], pages: Sequence[tuple[Path, int]]
+) -> list[int]:
+    """The order of pages of files by their places in a set, if there is one, else as they are."""
+    if not places:
+        return [*range(len(pages))]
+    own = [places[file.name][page] for file, page in pages]
+    counts = [len({*column}) for column in zip(*own, strict=True)]
+    names = zip(("images", "C", "Z", "T"), counts, strict=True)
+    axes = [f"{count} along {name}" for name, count in names if count > 1]
+    if len(axes) > 1 or len({*own}) < len(own):
+        raise Refused(
+            f"{where}: expected images along one axis of OME's description, got "
+            f"{' and '.join(axes) or 'two at one place'}; choose by pattern=... (views.pattern), "
+            f"or save the views as a stack of their own"
+        )
+    return sorted(range(len(own)), key=own.__getitem__)
 
 
 def view_files(
     folder: Path, pattern: str | None = None, gaps: bool = False, fields: Sequence[Path] = ()
 ) -> list[Path]:
     """The images of a folder without dark and flat fields, sorted by the InstanceNumber of DICOM
-    images, else by the numbers in their names.
+    images, by OME's description of a set of TIFF files, or else by the numbers in their names.
 
     Args:
         folder: folder of the images; names of `FIELDS` are excluded, unless all are. Other files
@@ -214,8 +242,11 @@ def view_files(
     images = [file for file in _images(folder, pattern) if file.resolve() not in excluded]
     views = [f for f in images if not any(x.match(f.name) for x in FIELDS.values())] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
-    by_instance = _by_instance(views, gaps) if _ending(views[0]) == "DICOM" else []
-    return by_instance or ordered(views, gaps, mixed=pattern is not None)
+    if _ending(views[0]) == "DICOM":
+        stated = _by_instance(views, gaps)
+    else:
+        stated = _of_set(views, gaps, chosen=pattern is not None)
+    return stated or ordered(views, gaps, mixed=pattern is not None)
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
@@ -298,6 +329,36 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     if not gaps:
         check_steps(folder, [[Decimal(known[file])] for file in in_order])
     return in_order
+
+
+def _of_set(files: Sequence[Path], gaps: bool, chosen: bool) -> list[Path]:
+    """TIFF files of one set by OME's description, which has their order; empty of others.
+
+    Args:
+        files: in a folder.
+        gaps: others of the set may be missing anywhere.
+        chosen: they may be consecutive ones.
+    """
+    places = header(files[0]).places if _ending(files[0]) == "TIFF" else {}
+    if not places:
+        return []
+    names = {file.name for file in files}
+    if absent := sorted(places.keys() - names if not (gaps or chosen) else []):
+        raise Refused(
+            f"{files[0].parent}: expected the {len(places)} files of the set that OME describes in "
+            f"{files[0].name}, got {len(names)} without {shown(absent)}; where views were left out "
+            f"on purpose: gaps=true, or pattern=... (views.pattern)"
+        )
+    if others := sorted(names - places.keys()):
+        raise Refused(
+            f"{files[0].parent}: expected the files of the set that OME describes in "
+            f"{files[0].name}, got {shown(others)} as well; choose by pattern=... (views.pattern); "
+            f"a file that was renamed needs its name back"
+        )
+    if not gaps:
+        numbers = [place for file in files for place in places[file.name]]
+        check_steps(files[0].parent, [[*map(Decimal, place)] for place in numbers])
+    return [*files]
 
 
 def _ending(file: Path) -> str:

@@ -35,12 +35,17 @@ MU_FILE = "mu.nii.gz"
 READ_PIXELS = 2**24
 
 
+#: A place in a set of files: the number of the image, and of the plane along C, Z and T.
+PlaceInSet = tuple[int, ...]
+
+
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
     these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
     have in common, those on which grey values or places depend, by their names a text for each
-    page, whether values are stated to be in proportion to intensity, and, where negative values
-    mark bad pixels, how many of these the file states.
+    page, whether values are stated to be in proportion to intensity, where negative values mark bad
+    pixels, how many of these the file states, and, of a set of files, the place of each page by the
+    file's name.
     """
 
     shape: tuple[int, int]
@@ -52,6 +57,7 @@ class Header(NamedTuple):
     stated: Mapping[str, Sequence[str]] = {}
     linear: bool = False
     excluded: int | None = None
+    places: Mapping[str, Sequence[PlaceInSet]] = {}
 
     @property
     def words(self) -> str:
@@ -97,6 +103,8 @@ class ProjectionStack(ABC):
     affine: np.ndarray | None = None
     #: Whether views, and fields beside them, are stored as seen from the detector's back.
     mirrored: bool = False
+    #: The HDF5 file of the scan, in which options may name further data sets.
+    scan: Path | None = None
     #: Where negative values mark pixels that a view could not measure: the number of those that the
     #: files state for all views.
     excluded: int | None = None
