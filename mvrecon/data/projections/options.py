@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+from mvrecon.core.quantities import InsideOrFile
 from mvrecon.data.projections.exposures import EXPOSURE_WORDS
 from mvrecon.data.projections.opening import Layout
 from mvrecon.data.projections.rings import Rings
@@ -23,17 +24,19 @@ class Measured:
             differ in how pixels are joined (`binning`), or "intensities" (grey values), converted
             to -ln of the transmission. None: as views.h5 states, counts for Interfile and DICOM NM,
             intensities for integer pixels; required for other floats.
-        dark: grey values without a beam: a number, or a path to images that are averaged. None: the
-            folder's images whose names begin with dark, or else 0.
+        dark: grey values without a beam: a number, or images that are averaged: the name of a data
+            set in the views' HDF5 file, or else a path. None: the folder's images whose names begin
+            with dark, or else 0.
         flat: grey values without an object, as `dark`. None: the folder's images whose names begin
             with flat.
         exposure: exposure of each view on disk relative to that of the flat field (exposure time,
             or its product with the tube's current): grey values above the dark field are divided by
-            it. A .npy, text with one number per line, a table with a column such as exposure, or
-            <file>:<column>, or <file>:<name> of a data set of an HDF5 file; or a name by which
-            views and flat field state theirs, or several joined by `*`: count_time or control/data
-            of NeXus, ExposureTime, ExposureInuAs and the like of DICOM; raises if others that they
-            state contradict it. None: all alike, with a warning where they state several.
+            it. The name of a data set in the views' HDF5 file, or <file>:<name> in another; a
+            .npy, text with one number per line, a table with a column such as exposure, or
+            <file>:<column>; or a name by which views and flat field state theirs, or several joined
+            by `*`: count_time or control/data of NeXus, ExposureTime, ExposureInuAs and the like of
+            DICOM; raises if others that they state contradict it. None: all alike, with a warning
+            where they state several.
         floor: transmissions are clamped to at least this, line integrals to at most -ln floor.
         dead: pixels whose flat - dark is at most this part of its median are dead: filled from
             their neighbours, and not in the mask.
@@ -80,9 +83,9 @@ class Measured:
 
     path: str | Path
     kind: Kind | None = None
-    dark: float | str | Path | None = None
-    flat: float | str | Path | None = None
-    exposure: str | Annotated[Path, EXPOSURE_WORDS] | None = None
+    dark: float | InsideOrFile | None = None
+    flat: float | InsideOrFile | None = None
+    exposure: Annotated[InsideOrFile, EXPOSURE_WORDS] | None = None
     floor: float = 1e-4
     dead: float = 0.05
     bad_pixels: str | Path | None = None
@@ -101,8 +104,8 @@ class Measured:
     gaps: bool = False
     layout: Layout | None = None
     dataset: str | None = None
-    angles: str | Path | None = None
-    image_key: str | Path | None = None
+    angles: InsideOrFile | None = None
+    image_key: InsideOrFile | None = None
 
     def __post_init__(self) -> None:
         if self.kind is not None and self.kind not in get_args(Kind):

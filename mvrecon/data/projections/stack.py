@@ -170,10 +170,6 @@ class ProjectionStack(ABC):
         except ValueError:
             return None
 
-    def field_at(self, name: str) -> "ProjectionStack | None":
-        """The images at a name inside the file; None if it has no such name."""
-        return None
-
     def check_rig(self, cameras: Cameras) -> None:
         """Compare cameras, one for each view, with what the file states of them.
 
