@@ -251,14 +251,14 @@ def _field(
     if isinstance(own, ProjectionStack):
         return own
     if value is not None:
-        return _field_at(views, name, value, layout)
+        return _field_at(views, name, str(value), layout)
     if folders:
         return open_projections(folders[0])
     return ImageFiles(files) if files else None
 
 
 def _field_at(
-    views: ProjectionStack, name: str, value: str | Path, layout: Layout | None
+    views: ProjectionStack, name: str, value: str, layout: Layout | None
 ) -> ProjectionStack:
     """A field's images by their name in the views' file, or by their own path."""
     if views.scan and (place := _place_in(views, value)):

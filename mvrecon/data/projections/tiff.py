@@ -120,7 +120,7 @@ def tiff_header(file: Path) -> Header:
                     f"{page.index}"
                 )
             numbers.append(page.tags.valueof("PageNumber"))
-        text = _description(file, pages[0].description)
+        text = _description(file, descriptions.without_own_id(pages[0].description))
         places = descriptions.places_in_set(text)
         _check_order(file, text, numbers, images, places)
         stated *= images // len(pages)
@@ -135,13 +135,13 @@ def tiff_header(file: Path) -> Header:
 
 def _description(file: Path, text: str) -> str:
     """The description of a file, where OME states that it is in another one beside it: that."""
-    for stated in descriptions.elements(descriptions.images(text), "BinaryOnly"):
+    for _, stated in descriptions.elements(text, "BinaryOnly"):
         other = file.with_name(Path(stated.get("MetadataFile", "")).name or file.name)
         if other != file and other.is_file():
             if other.suffix.lower() not in (".tif", ".tiff"):
                 return text_of(other)
             with _tiff(other) as (pages, _):
-                return pages[0].description
+                return descriptions.without_own_id(pages[0].description)
     return text
 
 
@@ -225,7 +225,7 @@ def _check_order(
         )
     planes = sorted(
         (int(place.get("IFD", 0)), sum(int(place.get(f"First{axis}", 0)) for axis in "ZCT"))
-        for place in descriptions.elements(descriptions.images(text), "TiffData")
+        for _, place in descriptions.elements(text, "TiffData")
     )
     if planes != sorted(planes, key=lambda plane: plane[1]):
         raise Refused(
