@@ -67,8 +67,8 @@ def evaluate(options: EvalSettings, folder: Path) -> Results:
     saved: list[Path] = []
 
     def save(scene: Batch, volumes: dict[str, Tensor]) -> None:
-        where = folder / "cases", scene, volumes, data.grid, data.data_range
-        saved.append(export.save_case(*where, saved))
+        case = export.save_case(folder / "cases", scene, volumes, data.grid, data.data_range, saved)
+        saved.append(case)
 
     on_scene = save if options.save else None
     other_rig = bool(options.camera or options.grid)

@@ -18,15 +18,23 @@ import yaml
 
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import MAX_YAML_BYTES, Refused, from_home, text_of, yaml_of
+from mvrecon.core.files.checks import (
+    MAX_YAML_BYTES,
+    TYPED,
+    Refused,
+    as_typed,
+    from_home,
+    text_of,
+    typed_in,
+    yaml_of,
+)
 from mvrecon.core.options import with_paths
+from mvrecon.core.quantities import INSIDE_MARK
 from mvrecon.core.registry import hint
 
 NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
-#: Options of views that name a data set of their file, or as <file>:<name> one of another.
-DATA_SETS = ("angles", "image_key")
 #: Values: numbers, words, products of names or patterns of them, and paths; nothing that refers.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
 #: What OmegaConf would resolve, outside of comments.
@@ -44,12 +52,16 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
 
 
 def _from_folder(folder: Path, path: str) -> str:
-    """A path as it begins in a folder: of a file, of a data set as <file>:<name>, or the name of a
-    data set alone, which is no file and begins at the root.
+    """A path as it begins in a folder: of a file, or of a data set as <file>:<name>; the name of a
+    data set alone, which is no file, as it was typed.
     """
     whole, (head, sign, name) = from_home(path), str(path).rpartition(":")
     if not whole.exists() and not sign:
-        return f"/{path.lstrip('/')}"
+        return as_typed(path)
+    start, mark, typed = str(path).rpartition(TYPED)
+    if mark and whole.exists():  # and a data set may have this name
+        between = os.path.relpath(Path(start).resolve(), folder.resolve())
+        return typed if between == "." else f"{between}{TYPED}{typed}"
     place, rest = (whole, "") if whole.exists() else (from_home(head), sign + name)
     return os.path.relpath(place.resolve(), folder.resolve()) + rest
 
@@ -112,11 +124,12 @@ def _settings(file: Path) -> Iterator[str]:
         raise Refused(f"{file}: no section is {unknown[0]!r}{hint(unknown[0], SECTIONS)}")
     if "camera" in told:
         told["camera"] = {"name": "from_file"} | told["camera"]
-    views = told.get("views", {})
-    for key in {*DATA_SETS} & {*views}:
-        if isinstance(name := views[key], str) and ":" not in name:
-            views[key] = f"/{name.lstrip('/')}"  # else a file beside this one
-    told = with_paths(told, ReconstructSettings, lambda path, _: file.parent / path)
+
+    def from_file(path: str, marks: tuple) -> str | Path:
+        inside = INSIDE_MARK in marks and not Path(path).is_absolute()
+        return typed_in(file.parent, path) if inside else file.parent / path
+
+    told = with_paths(told, ReconstructSettings, from_file)
     for section, options in told.items():
         if (name := options.pop("name", "from_file")) != "from_file":
             yield f"{section}={_word(file, section, name)}"
@@ -138,10 +151,10 @@ def _word(file: Path, key: str, value: Any) -> str:
     """A value as on a command line."""
     if isinstance(value, list):
         return f"[{','.join(_word(file, key, inner) for inner in value)}]"
-    if isinstance(value, Path):
-        told = str(value).removeprefix(f"{file.parent}/")
-        if "${" not in told and (value.exists() or NAMED.fullmatch(told)):
-            return str(value.absolute())
+    if isinstance(value, Path) or TYPED in str(value):
+        told = str(value).removeprefix(f"{file.parent.absolute()}/").removeprefix(f"{file.parent}/")
+        if "${" not in told and (Path(value).exists() or NAMED.fullmatch(told)):
+            return str(value.absolute() if isinstance(value, Path) else value)
     elif value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     elif isinstance(value, str | int | float) and WORD.fullmatch(str(value)):

@@ -34,7 +34,7 @@ from mvrecon.training.settings import (
     default,
 )
 
-ViewsOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.data.projections.views:Measured")]
+ViewsOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.data.projections.options:Measured")]
 AlignOptions: TypeAlias = Annotated[
     Options,
     OptionsOf("mvrecon.methods.calibration.self_alignment:self_aligned", passed=2),

@@ -16,7 +16,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mvrecon.core.files.checks import shown
 from mvrecon.core.parts import LISTED, REGISTRIES, TARGET_KEY, NamesOf, Options, OptionsOf, PartOf
-from mvrecon.core.quantities import WEIGHTS_MARK, NonNegativeFloat
+from mvrecon.core.quantities import NonNegativeFloat
 from mvrecon.core.registry import check_options, hint
 from mvrecon.core.signatures import (
     REQUIRED,
@@ -275,7 +275,7 @@ def later(value: Any) -> bool:
     return isinstance(value, str) and (value == "???" or "${" in value)
 
 
-def with_paths(value: Any, type: Any, change: Callable[[str, bool], str | Path]) -> Any:
+def with_paths(value: Any, type: Any, change: Callable[[str, tuple], str | Path]) -> Any:
     """Change every path within plain data of a type, but not those of callbacks and loggers, which
     are relative to the run's folder.
 
@@ -285,7 +285,7 @@ def with_paths(value: Any, type: Any, change: Callable[[str, bool], str | Path])
     Args:
         value: data to be copied.
         type: its type.
-        change: f(path, whether it may be a name of weights).
+        change: f(path, what it is annotated with), such as `WEIGHTS_MARK`.
     """
 
     def changed(value: Any, type: Any) -> Any:
@@ -296,6 +296,6 @@ def with_paths(value: Any, type: Any, change: Callable[[str, bool], str | Path])
         word = any(get_origin(m) is Literal and value in get_args(m) for m, _ in members)
         if word or any(isinstance(m, re.Pattern) and m.fullmatch(value) for m in marks[0]):
             return value
-        return change(value, WEIGHTS_MARK in marks[0])
+        return change(value, marks[0])
 
     return _mapped(value, type, "", changed, lambda s: getattr(s.mark, "targets", ""))

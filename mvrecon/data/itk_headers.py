@@ -87,6 +87,9 @@ META_TYPES = {
     **{"MET_UCHAR": "u1", "MET_USHORT": "u2", "MET_UINT": "u4", "MET_ULONG": "u4"},
     **{"MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8"},
 }
+#: Cosine of the angle up to which an oblique axis may be named by another side than the nearest, as
+#: ITK does where two axes are near one side.
+NAMED = 0.25
 #: The truth by the first letters that ITK accepts.
 TRUTH = {"true": True, "t": True, "1": True, "false": False, "f": False, "0": False}
 #: Fields of NRRD, all applied by ITK but where noted. A key/value pair (key:=value) is no field.
@@ -296,11 +299,15 @@ def _check_axes(path: Path, entries: Mapping[str, str], numbers: Mapping[str, An
             f"{lengths.round(4).tolist()}; ElementSpacing has the voxel size"
         )
     name = entries.get("AnatomicalOrientation", "").upper()
+    if not re.fullmatch("[RLAPIS]{3}", name):
+        return
+    pairs = [divmod("LRPASI".index(side), 2) for side in name]
+    along = np.array([axes[n, k] * (1 - 2 * away) for n, (k, away) in enumerate(pairs)])
+    if len({k for k, _ in pairs}) == 3 and (min(along) > NAMED or max(along) < -NAMED):
+        return
     largest = np.abs(axes).argmax(axis=1)
     sides = [("RL", "AP", "IS")[k][int(axes[n, k] > 0)] for n, k in enumerate(largest)]
     towards, away = "".join(sides), "".join("LRPASI"["RLAPIS".index(side)] for side in sides)
-    if not re.fullmatch("[RLAPIS]{3}", name) or name in (towards, away):
-        return
     message = (
         f"{path}: expected the AnatomicalOrientation {away} (axes from) or {towards} (towards) of "
         f"its TransformMatrix, got {name}"

@@ -151,17 +151,19 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
         raise Refused(f"{path}: {dataset.name!r} is empty; expected numbers or text")
     item = dataset.id.get_type().get_size()
     whole, one = math.prod(dataset.shape) * item, math.prod(dataset.shape[1:]) * item
-    chunk = math.prod(dataset.chunks or ()) * item
+    chunk, plane = (math.prod(n or ()) * item for n in (dataset.chunks, dataset.shape[-2:]))
+    largest = max(MAX_CHUNK_BYTES, plane if dataset.ndim > 2 else 0)  # a plane is read at once
     sizes = (
         f"{path}: {dataset.name!r} declares {dataset.shape} x {item} bytes, in chunks of "
         f"{dataset.chunks}"
     )
     if whole > most or one > VOLUME:
         raise Refused(f"{sizes}; expected at most {most} bytes, {VOLUME} at once")
-    if chunk > MAX_CHUNK_BYTES or max(dataset.shape[1:], default=1) > EDGE:
+    if chunk > largest or max(dataset.shape[1:], default=1) > EDGE:
+        ones = "x".join(str(min(n, 2**10)) for n in (1, *dataset.shape[1:]))
         raise Refused(
-            f"{sizes}; expected chunks of at most {MAX_CHUNK_BYTES} bytes and {EDGE} voxels along "
-            "z, y and x"
+            f"{sizes}; expected chunks of at most {largest} bytes and {EDGE} voxels along z, y and "
+            f"x; h5repack -l {dataset.name}:CHUNK={ones} writes a copy with smaller chunks"
         )
     return dataset
 

@@ -114,6 +114,11 @@ def _range(path: Path, text: str, dtype: np.dtype) -> tuple[float, float]:
         ends = (-math.inf, math.inf)
         if dtype.kind != "f":
             ends = (float(np.iinfo(dtype).min), float(np.iinfo(dtype).max))
+        if not math.isfinite(high - low):
+            raise Refused(
+                f"{path}: expected a datarange of finite values, or 0 -1, which states none, got "
+                f"{text}; correct it where the values are stored as they are"
+            )
         if not (ends[0] <= low + below and low <= high and high - above <= ends[1]):
             raise Refused(
                 f"{path}: expected a datarange of values of {dtype.name} as they are stored, got "

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
@@ -13,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import PART_ENDING, written_whole
 from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.dataset import Batch
 from mvrecon.data.nifti import save_nifti
@@ -150,7 +151,8 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
     """Write the views of one case as a detector's grey values in `projections`: 16-bit TIFF with
     dark and flat field.
 
-    Convention: RTK's; the first row is the lowest one, opposite to `views`.
+    Convention: RTK's; the first row is the lowest one, opposite to `views`. Those of an interrupted
+    run are replaced image by image, so that each is whole, and other files stay.
 
     Args:
         folder: folder of all cases.
@@ -161,8 +163,18 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
         ValueError: integrals beyond the range of 16 bits, as of another unit than 1/mm.
     """
     check_greys(views)
-    case = folder / file_name(name)
-    return write_projections(case / "projections", views.flip(-2), Exposure(photons=None))
+    path = folder / file_name(name) / "projections"
+    earlier = {image.name for image in path.glob("view_*.tif")}
+    part = path.with_name(f".projections.{os.getpid()}{PART_ENDING}") if earlier else path
+    write_projections(part, views.flip(-2), Exposure(photons=None))
+    if earlier:
+        for image in part.iterdir():
+            os.replace(image, path / image.name)
+            earlier.discard(image.name)
+        part.rmdir()
+        for name in earlier:  # of a rig with more views
+            (path / name).unlink()
+    return path
 
 
 def check_greys(views: Float[Tensor, "*m v u"]) -> None:

@@ -3,8 +3,10 @@
 Importing this file imports no part and neither torch nor Lightning: types name them.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
@@ -116,7 +118,7 @@ class TrainSettings(Measurement):
 
         Raises:
             ValueError: a label that equals the main one's, differs from another only in case, is
-                "truth", or is not a valid file name.
+                "truth" or is the name of another's checkpoint, or is not a valid file name.
         """
         label = self.label or self.method["name"]
         others = {other: method for other, method in (self.compare or {}).items() if method}
@@ -131,6 +133,16 @@ class TrainSettings(Measurement):
             raise ValueError(
                 f"A method labelled {taken[0]!r} would overwrite truth.nii.gz; expected another "
                 f"label"
+            )
+        names = {
+            label: {f"{str(label).casefold()}{end}" for end in ("", ".ckpt", ".previous.ckpt")}
+            for label in labelled
+        }
+        used = Counter(chain.from_iterable(names.values()))
+        if shared := [label for label, own in names.items() if any(used[n] > 1 for n in own)]:
+            raise ValueError(
+                f"Methods labelled {' and '.join(map(repr, shared))} would write files of one "
+                f"name, where case does not count; expected other labels"
             )
         return {
             plain_name(name, "label" if name == label else "compare"): method

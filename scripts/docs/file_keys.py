@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mvrecon.core.files.keys import Key
 from mvrecon.data import dicom, dicom_image, itk_headers, nifti, vgi
-from mvrecon.data.projections import images, nexus, rtk_images, tiff
+from mvrecon.data.projections import images, nexus, png, rtk_images, tiff
 from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
 from mvrecon_spect.files import interfile_keys, nm, nm_volume
 
@@ -31,7 +31,7 @@ FORMATS: dict[str, Sequence[Key]] = {
     "DICOM NM (plugin `mvrecon-spect`)": nm.KEYS,
     "DICOM NM volumes": nm_volume.KEYS,
     "TIFF": tiff.TIFF_KEYS,
-    "PNG": images.PNG_KEYS,
+    "PNG": png.PNG_KEYS,
     "HDF5 of beamlines": nexus.KEYS,
     "EDF": rtk_images.EDF_KEYS,
     "Elekta's .his": rtk_images.HIS_KEYS,

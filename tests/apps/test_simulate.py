@@ -20,9 +20,11 @@ from mvrecon.apps.reconstruct import read_scan
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import CAMERAS, SCENES
+from mvrecon.data.projections import writing
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.camera import VECTORS
+from mvrecon.geometry.cameras.files import save
 from mvrecon.geometry.grid import Grid
 
 GRID = ("grid.size=[16,16,16]", "grid.spacing=8")
@@ -230,6 +232,67 @@ def test_the_rig_for_rtk_turns_about_the_axis_that_rtk_s_fdk_takes_its_angles_ab
     assert torch.allclose(gantry.diff() % 360, torch.tensor(60.0), atol=1e-4)
     for tilt in ("OutOfPlaneAngle", "InPlaneAngle"):
         assert all(abs(float(view.findtext(tilt))) < 1e-9 for view in views)
+
+
+def contents(folder):
+    """The bytes of every file of a run's cases by their names."""
+    cases = folder / "cases"
+    return {f.relative_to(cases): f.read_bytes() for f in cases.rglob("*") if f.is_file()}
+
+
+@pytest.mark.parametrize("written", [3, 9])
+def test_an_interrupted_run_with_grey_values_continues(written, tmp_path, monkeypatch):
+    """In the first case and in the second: whole cases stay whole, and no folder has a part of its
+    images; what a killed process leaves is removed, other files stay.
+    """
+    options = (*GRID, "camera.n_views=3", "scene.value=0.02", "rtk=true", "cases=[0,1]")
+    call(tmp_path / "whole", *options)
+    left, write = [written], writing._write
+
+    def interrupted(path, grey):
+        left[0] -= 1
+        if left[0] < 0:
+            path.write_bytes(b"half")
+            raise KeyboardInterrupt
+        write(path, grey)
+
+    monkeypatch.setattr(writing, "_write", interrupted)
+    with pytest.raises((KeyboardInterrupt, SystemExit)):
+        call(tmp_path / "run", *options)
+    monkeypatch.undo()
+    folders = [*(tmp_path / "run").rglob("projections")]
+    assert len(folders) == written // 5 and all(len([*f.iterdir()]) == 5 for f in folders)
+    case = next((tmp_path / "run" / "cases").iterdir())
+    (case / ".projections.99.part").mkdir()
+    (case / ".projections.99.part" / "view_00000.tif").write_bytes(b"half")
+    mine = {case / "note.txt", *(folder / "view_00000.txt" for folder in folders)}
+    for path in mine:
+        path.write_text("mine")
+    call(tmp_path / "run", *options)
+    assert all(path.read_text() == "mine" for path in mine)
+    for path in mine:
+        path.unlink()
+    found, expected = (contents(tmp_path / name) for name in ("run", "whole"))
+    images = {name for name in expected if name.suffix == ".tif"}
+    assert found.keys() == expected.keys() and len(images) == 10
+    assert all(found[name] == expected[name] for name in images)
+
+
+def test_fewer_views_than_an_earlier_run_had_leave_none_of_these(tmp_path):
+    """Of a rig in a file that has changed since."""
+    rig = {
+        "name": "circular",
+        "sid": 400.0,
+        "sdd": 800.0,
+        "detector": {"pixels": 24, "pixel_mm": 12},
+    }
+    save(CAMERAS.from_config({**rig, "n_views": 4}), tmp_path / "rig.json")
+    options = (*GRID, "camera=from_file", f"camera.path={tmp_path}/rig.json", "scene.value=0.02")
+    call(tmp_path / "run", *options, "rtk=true")
+    save(CAMERAS.from_config({**rig, "n_views": 3}), tmp_path / "rig.json")
+    call(tmp_path / "run", *options, "rtk=true")
+    (folder,) = (tmp_path / "run").rglob("projections")
+    assert len([*folder.glob("view_*.tif")]) == 3
 
 
 @pytest.mark.parametrize(

@@ -235,6 +235,36 @@ def test_images_of_itk_in_any_direction_are_read_without_a_word(packed, ending, 
         assert found[-x, -y, z] == value
 
 
+def turned(degrees, axis, left_handed):
+    """Directions of axes turned about one of the world's, of which one may be reversed."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.radians(degrees)
+    turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return turn @ np.diag([1, -1 if left_handed else 1, 1])
+
+
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0, 1, 0), (1, 0, 0), (1, 1, 0), (1, 1, 1), (1, 2, 3)])
+@pytest.mark.parametrize("left_handed", [False, True])
+def test_oblique_images_of_itk_are_read_without_a_word(left_handed, axis, tmp_path):
+    """ITK names their axes by sides, two of which are as near at 45 degrees."""
+    for degrees in (*range(0, 360, 15), 44.999, 45.001, 54.7356, 70.5288):
+        image = sitk.GetImageFromArray(VALUES)
+        image.SetDirection(turned(degrees, axis, left_handed).ravel().tolist())
+        sitk.WriteImage(image, str(tmp_path / "a.mha"))
+        places(tmp_path / "a.mha")
+
+
+@pytest.mark.parametrize("name", ["LPI", "RPS", "PLS", "SPL", "LLS", "RAS", "LSA"])
+def test_a_name_of_slightly_oblique_axes_is_checked(name, tmp_path):
+    """Of axes that are up to 12 degrees off, as of a tilted gantry."""
+    for axis in ((0, 0, 1), (1, 0, 0), (1, 2, 3)):
+        words = " ".join(f"{x:.17g}" for x in turned(12, axis, False).T.ravel())
+        path = meta(tmp_path / "a.mha", f"AnatomicalOrientation = {name}", TransformMatrix=words)
+        with pytest.warns(UserWarning, match=f"AnatomicalOrientation RAI .* got {name}"):
+            places(path)
+
+
 NO_SPACE = {"space": "", "space_directions": "", "space_origin": ""}
 NRRD_READ = {
     "a pair named as a field": ({"old_min:=": "0"}, expected()),

@@ -92,6 +92,12 @@ REFUSED = {
     "values beyond the last digit": (_ranged("-3.00 19.99"), "within the datarange .*got 20"),
     "another constant": (_ranged("5 5"), "within the datarange 5 5, got -3"),
     "a range of the wrong way": (_ranged("20 -3"), "expected a datarange of values of float32"),
+    "an infinite range": (
+        _ranged("-inf inf"),
+        "of finite values, or 0 -1, .* got -inf inf; correct",
+    ),
+    "a range without an end": (_ranged("-3 inf"), "of finite values, or 0 -1, .* got -3 inf"),
+    "a range of no number": (_ranged("nan nan"), "of finite values, or 0 -1, .* got nan nan"),
     "values above a range": (_ranged("-3 19.9"), "within the datarange -3 19.9, got 20"),
     "a range beyond the type": (
         _ranged("0 65535", kind="unsigned integer", bits=8, values=(VALUES + 3).astype("u1")),

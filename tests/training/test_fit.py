@@ -170,6 +170,19 @@ def test_no_method_can_be_labelled_as_the_truth(settings):
             replace(settings, compare={label: {"name": "sirt"}}).methods()
 
 
+@pytest.mark.parametrize(
+    "label", ["SIRT", "Sirt", "sirt.ckpt", "Sirt.previous", "sirt.previous.ckpt"]
+)
+def test_no_two_methods_write_files_of_one_name(label, settings):
+    """Volumes and checkpoints, on file systems that ignore case as well."""
+    for main, other in ((label, "sirt"), ("sirt", label)):
+        chosen = replace(settings, label=main, compare={other: {"name": "sirt"}})
+        with pytest.raises(ValueError, match=f"labelled '{main}' and '{other}' would write files"):
+            chosen.methods()
+    for free in ("sirt2", "views", "planes", "truth2", "sirt.nii.gz", "results", "last"):
+        assert free in replace(settings, compare={free: {"name": "sirt"}}).methods()
+
+
 def test_an_unfinished_method_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"mine.ckpt: did the training of 'mine' end\?"):
         trained.load_checkpoint(checkpoints.finished(tmp_path, "mine"))

@@ -39,7 +39,7 @@ from mvrecon.apps.config.errors import one_line, reported
 from mvrecon.apps.config.grammar import MULTIRUN, CommandLine
 from mvrecon.apps.config.help import help_text
 from mvrecon.apps.settings import RECORDS
-from mvrecon.core.files.checks import from_home
+from mvrecon.core.files.checks import from_home, typed_in
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
@@ -49,6 +49,7 @@ from mvrecon.core.options import (
     with_paths,
 )
 from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.quantities import INSIDE_MARK, WEIGHTS_MARK
 from mvrecon.core.registry import check_options, hint, import_plugins, locate
 from mvrecon.core.signatures import alternatives
 
@@ -305,11 +306,12 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
         record: the type of the app's settings.
     """
 
-    return with_paths(
-        settings,
-        record,
-        lambda path, weights: str(of_weights(path) if weights else from_home(path).absolute()),
-    )
+    def absolute(path: str, marks: tuple) -> str:
+        if INSIDE_MARK in marks:
+            return typed_in(Path.cwd(), path)
+        return str(of_weights(path) if WEIGHTS_MARK in marks else from_home(path).absolute())
+
+    return with_paths(settings, record, absolute)
 
 
 def record_of(config: DictConfig, record: type[Record]) -> Record:

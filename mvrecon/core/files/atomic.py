@@ -155,8 +155,8 @@ def claimed(folder: Path) -> Iterator[None]:
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         lock.flush()
-        for part in folder.rglob(f".*.[0-9]*{PART_ENDING}"):
-            part.unlink(missing_ok=True)
+        for part in [*folder.rglob(f".*.[0-9]*{PART_ENDING}")]:
+            shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
         yield
 
 

@@ -161,6 +161,23 @@ def from_home(path: str | os.PathLike[str]) -> Path:
     return Path(os.path.expanduser(path))
 
 
+#: Between a folder and what was typed there, in a path; `Path` takes it for a single slash.
+TYPED = "/./"
+
+
+def typed_in(folder: Path, path: str) -> str:
+    """An absolute path, of which `as_typed` returns what was typed in a folder: it may be a name
+    inside a file instead.
+    """
+    path = os.path.expanduser(path)
+    return path if os.path.isabs(path) else f"{folder.absolute()}{TYPED}{path}"
+
+
+def as_typed(path: str | Path) -> str:
+    """What was typed in a folder, see `typed_in`; other paths as they are."""
+    return str(path).rpartition(TYPED)[2]
+
+
 def plain_name(name: Any, where: str | Path) -> str:
     """Check that a name is a valid file or folder name, and not a path; return it.
 

@@ -4,6 +4,9 @@
 
 import math
 import re
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,7 @@ import numpy as np
 from mvrecon.core.files.checks import Refused, millimetres, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
-from mvrecon.data.projections.stack import Header
+from mvrecon.data.projections.stack import Header, PlaceInSet
 
 #: OME's types of pixels.
 TYPES = {f"int{bits}": f"i{bits // 8}" for bits in (8, 16, 32)}
@@ -70,17 +73,67 @@ QUOTED = re.compile(
     r".*?</(?:\w+:)?\1\s*>",
     re.DOTALL,
 )
+#: The identifier of a file in the root of OME's description.
+OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
+#: An element of OME's description that says which page of a file is which image.
+PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
 #: A comma between thousands.
 THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
-def elements(text: str, name: str) -> list[dict[str, str]]:
-    """The attributes of each element of OME's description of a name; none of other texts."""
+def without_own_id(text: str) -> str:
+    """OME's description without the identifier of its own file: that of a set is one text, which is
+    read once.
+    """
+    return OWN_ID.sub("", text, count=1)
+
+
+@lru_cache(maxsize=4)
+def images(text: str) -> list[str]:
+    """OME's description up to the first image, and from each one to the next; none of other
+    texts.
+    """
     text = QUOTED.sub("", text)
-    found = re.findall(rf"<(?:\w+:)?{name}\b([^>]*)>", text) if OME.search(text) else []
-    return [dict(ATTRIBUTE.findall(attributes)) for attributes in found]
+    return re.split(r"<(?:\w+:)?Image\b", text) if OME.search(text) else []
+
+
+@lru_cache(maxsize=32)
+def elements(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
+    """The elements of a name in OME's description: the number of the image, and the attributes."""
+    found = [re.findall(rf"<(?:\w+:)?{name}\b([^>]*)>", part) for part in images(text)]
+    return [(n, dict(ATTRIBUTE.findall(one))) for n, part in enumerate(found) for one in part]
+
+
+@lru_cache(maxsize=4)
+def places_in_set(text: str) -> dict[str, list[PlaceInSet]]:
+    """Where OME places the pages of the files of a set, by the names of these; empty where it names
+    fewer than two files.
+    """
+    pages: dict[str, list[tuple[int, PlaceInSet]]] = {}
+    for number, image in enumerate(images(text)):
+        for attributes, inside in PLACED.findall(image):
+            own, name = (dict(ATTRIBUTE.findall(part)) for part in (attributes, inside))
+            if "FileName" in name:
+                page = int(own.get("IFD", 0)), _place(number, own, "First")
+                pages.setdefault(unescape(name["FileName"]), []).append(page)
+    if len(pages) < 2:
+        return {}
+    return {name: [place for _, place in sorted(those)] for name, those in pages.items()}
+
+
+@lru_cache(maxsize=4)
+def _planes(text: str) -> dict[PlaceInSet, list[dict[str, str]]]:
+    """The planes of OME's description by their places."""
+    planes: dict[PlaceInSet, list[dict[str, str]]] = {}
+    for number, plane in elements(text, "Plane"):
+        planes.setdefault(_place(number, plane, "The"), []).append(plane)
+    return planes
+
+
+def _place(number: int, attributes: Mapping[str, str], start: str) -> PlaceInSet:
+    return number, *(int(attributes.get(f"{start}{axis}", 0)) for axis in "CZT")
 
 
 def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
@@ -103,7 +156,7 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
                 head = head._replace(tops=_tops(file, "BitDepth", bits, head))
         if ms is not None:
             _add(stated, "ExposureTime", 0, milliseconds(file, ms, "ms"))
-    entries = dict(LINE.findall(text))
+    entries = dict(LINE.findall(text)) if "#" in text else {}
     if not {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
         return head._replace(stated=stated)
 
@@ -140,19 +193,22 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
     return head._replace(stated=stated)
 
 
-def of_file(file: Path, head: Header, text: str) -> Header:
+def of_file(
+    file: Path, head: Header, text: str, places: Mapping[str, Sequence[PlaceInSet]]
+) -> Header:
     """The header of all pages, in the order of the images, with what OME states of them.
 
     Args:
-        file: for messages.
+        file: whose name is that of a file of the set.
         head: by the pages.
         text: the description of the first page.
+        places: those in a set of files, see `places_in_set`.
 
     Raises:
         Refused: another type of pixels than it states, or more bits than they have.
     """
     stated = {name: list(texts) for name, texts in head.stated.items()}
-    for pixels in elements(text, "Pixels"):
+    for _, pixels in elements(text, "Pixels"):
         kind = pixels.get("Type", "")
         if np.dtype(TYPES.get(kind, head.dtype)) != head.dtype.newbyteorder("="):
             raise Refused(f"{file}: expected pixels of OME's Type {kind}, got {head.dtype}")
@@ -160,11 +216,13 @@ def of_file(file: Path, head: Header, text: str) -> Header:
             head = head._replace(tops=_tops(file, "SignificantBits", bits, head))
     for name, keys in OME_BEAM.items():
         for key in keys:
-            found = sorted({one[key] for one in elements(text, name) if key in one})
+            found = sorted({one[key] for _, one in elements(text, name) if key in one})
             for page in range(head.pages if found else 0):
                 _add(stated, f"{name} {key}", page, " or ".join(found), head.pages)
-    for plane in elements(text, "Plane"):
-        page = sum(int(plane.get(f"The{axis}", 0)) for axis in "ZCT")  # one of them runs
+    pages = [(sum(place[1:]), place) for place in _planes(text)]  # one of them runs
+    if places:
+        pages = [*enumerate(places[file.name])]
+    for page, plane in ((page, plane) for page, at in pages for plane in _planes(text).get(at, ())):
         if "ExposureTime" in plane and page < head.pages:
             unit = plane.get("ExposureTimeUnit", "s")
             if (time := number_of(plane["ExposureTime"], f"{file}: ExposureTime")) is not None:

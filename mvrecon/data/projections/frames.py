@@ -137,7 +137,7 @@ class FrameViews(ProjectionStack):
         numbers: numbers of the frames that are views.
         fields: flat and dark fields.
         rig: the rig that the file states.
-        folder: other files must be in it, or below.
+        scan: see `ProjectionStack`.
         stated: exposure and beam of all frames by name, a text for each, "" if none is stated.
         marked: mask of bad pixels.
         top: greatest grey value; None: that of the type.
@@ -149,12 +149,12 @@ class FrameViews(ProjectionStack):
         numbers: np.ndarray,
         fields: dict[str, ProjectionStack] | None = None,
         rig: dict[str, Any] | None = None,
-        folder: Path | None = None,
+        scan: Path | None = None,
         stated: Mapping[str, np.ndarray] | None = None,
         marked: np.ndarray | None = None,
         top: float | None = None,
     ):
-        self._frames, self._numbers, self._folder = frames, numbers, folder
+        self._frames, self._numbers, self.scan = frames, numbers, scan
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig = fields or {}, rig
@@ -170,13 +170,6 @@ class FrameViews(ProjectionStack):
     @property
     def top(self) -> float | None:
         return super().top if self._top is None else self._top
-
-    def field_at(self, name: str) -> ProjectionStack | None:
-        place = followed(self._frames.place.path, name, EXPECTED, self._folder)
-        if place is None:
-            return None
-        frames = Frames(place, self._folder or place.path.parent.resolve())
-        return FrameViews(frames, np.arange(frames.shape[0]))
 
     def _block(self, first: int, last: int) -> np.ndarray:
         return self._frames.read(self._numbers[first:last])

@@ -1,55 +1,32 @@
 """Projections as images: a folder of TIFF, PNG, DICOM or RTK's files, or one file of several pages.
 
-Pillow reads PNG; for TIFF see `mvrecon.data.projections.tiff`, for RTK's formats `rtk_images`.
+For TIFF see `mvrecon.data.projections.tiff`, for PNG `png`, for RTK's formats `rtk_images`.
 """
 
 import re
-import struct
 import warnings
-import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
-from functools import cached_property
-from itertools import islice
+from itertools import groupby, islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from jaxtyping import Bool
-from torch import Tensor
 
-from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.checks import Refused, check_file, file_errors, shown
+from mvrecon.core.files.keys import Key
 from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures, rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
-from mvrecon.data.projections.stack import VIEWS, Header, ProjectionStack
+from mvrecon.data.projections.png import png_header, png_pages
+from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet, ProjectionStack
 from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
 #: Formats of image files by their ending; others may be DICOM.
 ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", **rtk_images.ENDINGS}
 #: Files below a folder without images that are looked at, to name the folder that has some.
 LOOKED_AT = 1000
-#: Pixel types of a grey PNG by Pillow's mode.
-MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
-#: Tag of EXIF for the order of rows and columns.
-ORIENTATION = 274
-#: Chunks and fields of PNG that change the pixels.
-PNG_KEYS = (
-    Key("bit depth", "refused", "Pillow rescales fewer bits", (8, 16)),
-    Key("colour type", "refused", "grey values", (0,)),
-    Key("interlace method", "applied"),
-    Key("acTL", "refused", "one image in each file"),
-    Key("pCAL", "refused", "store the values that the calibration gives"),
-    Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
-    Key("gAMA, sRGB, iCCP, cICP, cHRM, tRNS", "ignored", "display alone"),
-    Key("pHYs, oFFs, sCAL", "ignored", "origin and print size"),
-    Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
-)
 #: Attributes of DICOM projections that all views have in common.
 ALIKE = (
     "FieldOfViewOrigin",
@@ -128,19 +105,6 @@ DICOM_KEYS = (
         "the camera decides",
     ),
 )
-#: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
-PLAIN, INTERLACED = (
-    [(0, 0, 1, 1)],
-    [
-        (0, 0, 8, 8),
-        (4, 0, 8, 8),
-        (0, 4, 4, 8),
-        (2, 0, 4, 4),
-        (0, 2, 2, 4),
-        (1, 0, 2, 2),
-        (0, 1, 1, 2),
-    ],
-)
 #: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001; the
 #: ESRF has refHST0000.edf, dark.edf, and darkend0000.edf, a sum of images, which is no field.
 FIELDS = {
@@ -150,10 +114,10 @@ FIELDS = {
 
 
 class ImageFiles(ProjectionStack):
-    """Views as images, one in each file, or all in one file of several pages.
+    """Views as images, one in each file, or all in one file of several pages, or in those of a set.
 
     Args:
-        files: the views' files, in their order.
+        files: the views' files, in their order; those of a set have its own.
 
     Raises:
         Refused: images of several sizes or types, colours, a file that is damaged, or one with a
@@ -167,8 +131,13 @@ class ImageFiles(ProjectionStack):
                 raise Refused(
                     f"{file}: expected {headers[0].words} as {files[0].name}, got {other.words}"
                 )
-            if len(files) > 1 and other.pages > 1:
+            if len(files) > 1 and other.pages > 1 and not other.places:
                 raise Refused(f"{file}: expected one image in each file, got {other.pages}")
+            if len(files) > 1 and other.places != headers[0].places:
+                raise Refused(
+                    f"{file}: expected files of one set by OME's description, as {files[0].name} "
+                    f"is, got another; choose by pattern=... (views.pattern)"
+                )
             if other.pixel_mm != headers[0].pixel_mm:
                 raise Refused(
                     f"{file}: expected the ImagerPixelSpacing {headers[0].pixel_mm} of "
@@ -180,17 +149,17 @@ class ImageFiles(ProjectionStack):
                         f"{file}: expected the {name} {first} of {files[0].name}, got {value}; "
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
-        self.stated = {
-            name: [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
-            for name in dict.fromkeys(
-                (*COMPARED, *(key for head in headers for key in head.stated))
-            )
-        }
+        where = files[0] if len(files) == 1 else files[0].parent
+        pages = [(f, k) for f, head in zip(files, headers, strict=True) for k in range(head.pages)]
+        order = _order_of(where, headers[0].places, pages)
+        self.stated = {}
+        for name in dict.fromkeys((*COMPARED, *(key for head in headers for key in head.stated))):
+            own = [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
+            self.stated[name] = [own[k] for k in order]
         for name, texts in self.stated.items():
             cure = "which the camera must have" if name in CAMERA_PLACES else ""
             exposures.warn_of_several(files[0].parent, name, texts, cure)
-        self.files, self._excluded = list(files), headers[0].excluded
-        self.negative_is_bad = self._excluded is not None
+        self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm, self._tops = (
             headers[0].pixel_mm,
             frozenset().union(*(head.tops for head in headers)),
@@ -201,10 +170,10 @@ class ImageFiles(ProjectionStack):
         }
         if all(head.linear for head in headers):
             self.kind = "intensities"
-        single = len(files) == 1
-        names = [f"{files[0].stem} {k}" for k in range(headers[0].pages)] if single else []
-        names = names if len(names) > 1 else [file.stem for file in files]
-        super().__init__(files[0] if single else files[0].parent, names, *headers[0][:2])
+        self._pages = [pages[k] for k in order]
+        alone = {file for file, head in zip(files, headers, strict=True) if head.pages == 1}
+        names = [f.stem if f in alone else f"{f.stem} {k}" for f, k in self._pages]
+        super().__init__(where, names, *headers[0][:2])
 
     @property
     def top(self) -> float | None:
@@ -221,35 +190,39 @@ class ImageFiles(ProjectionStack):
             )
         return next(iter(self._tops))
 
-    @cached_property
-    def marked(self) -> Bool[Tensor, "v u"] | None:
-        """Negative pixels of the first view, where these are no counts.
-
-        Warns:
-            UserWarning: the file states more.
-        """
-        if self._excluded is None:
-            return None
-        marked = torch.from_numpy(self._block(0, 1)[0] < 0)
-        if marked.sum() < self._excluded:
-            warnings.warn(
-                f"{self.path}: expected as many negative pixels as N_excluded_pixels states, "
-                f"{self._excluded}, got {int(marked.sum())}; give the others as views.bad_pixels",
-                stacklevel=2,
-            )
-        return marked
-
     def _block(self, first: int, last: int) -> np.ndarray:
-        if len(self.files) == 1:
-            return np.stack(list(_pages(self.files[0], first, last)))
-        return np.stack([next(_pages(file, 0, 1)) for file in self.files[first:last]])
+        found: list[np.ndarray] = []
+        pages = enumerate(self._pages[first:last])
+        for (file, _), run in groupby(pages, key=lambda one: (one[1][0], one[1][1] - one[0])):
+            numbers = [page for _, (_, page) in run]  # one after the other
+            found += _pages(file, numbers[0], numbers[-1] + 1)
+        return np.stack(found)
+
+
+def _order_of(
+    where: Path, places: Mapping[str, Sequence[PlaceInSet]], pages: Sequence[tuple[Path, int]]
+) -> list[int]:
+    """The order of pages of files by their places in a set, if there is one, else as they are."""
+    if not places:
+        return [*range(len(pages))]
+    own = [places[file.name][page] for file, page in pages]
+    counts = [len({*column}) for column in zip(*own, strict=True)]
+    names = zip(("images", "C", "Z", "T"), counts, strict=True)
+    axes = [f"{count} along {name}" for name, count in names if count > 1]
+    if len(axes) > 1 or len({*own}) < len(own):
+        raise Refused(
+            f"{where}: expected images along one axis of OME's description, got "
+            f"{' and '.join(axes) or 'two at one place'}; choose by pattern=... (views.pattern), "
+            f"or save the views as a stack of their own"
+        )
+    return sorted(range(len(own)), key=own.__getitem__)
 
 
 def view_files(
     folder: Path, pattern: str | None = None, gaps: bool = False, fields: Sequence[Path] = ()
 ) -> list[Path]:
     """The images of a folder without dark and flat fields, sorted by the InstanceNumber of DICOM
-    images, else by the numbers in their names.
+    images, by OME's description of a set of TIFF files, or else by the numbers in their names.
 
     Args:
         folder: folder of the images; names of `FIELDS` are excluded, unless all are. Other files
@@ -269,8 +242,11 @@ def view_files(
     images = [file for file in _images(folder, pattern) if file.resolve() not in excluded]
     views = [f for f in images if not any(x.match(f.name) for x in FIELDS.values())] or images
     _check_kind(folder, views, f" named {pattern}" if pattern else "")
-    by_instance = _by_instance(views, gaps) if _ending(views[0]) == "DICOM" else []
-    return by_instance or ordered(views, gaps, mixed=pattern is not None)
+    if _ending(views[0]) == "DICOM":
+        stated = _by_instance(views, gaps)
+    else:
+        stated = _of_set(views, gaps, chosen=pattern is not None)
+    return stated or ordered(views, gaps, mixed=pattern is not None)
 
 
 def field_files(folder: Path, field: str) -> list[Path]:
@@ -355,6 +331,36 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     return in_order
 
 
+def _of_set(files: Sequence[Path], gaps: bool, chosen: bool) -> list[Path]:
+    """TIFF files of one set by OME's description, which has their order; empty of others.
+
+    Args:
+        files: in a folder.
+        gaps: others of the set may be missing anywhere.
+        chosen: they may be consecutive ones.
+    """
+    places = header(files[0]).places if _ending(files[0]) == "TIFF" else {}
+    if not places:
+        return []
+    names = {file.name for file in files}
+    if absent := sorted(places.keys() - names if not (gaps or chosen) else []):
+        raise Refused(
+            f"{files[0].parent}: expected the {len(places)} files of the set that OME describes in "
+            f"{files[0].name}, got {len(names)} without {shown(absent)}; where views were left out "
+            f"on purpose: gaps=true, or pattern=... (views.pattern)"
+        )
+    if others := sorted(names - places.keys()):
+        raise Refused(
+            f"{files[0].parent}: expected the files of the set that OME describes in "
+            f"{files[0].name}, got {shown(others)} as well; choose by pattern=... (views.pattern); "
+            f"a file that was renamed needs its name back"
+        )
+    if not gaps:
+        numbers = [place for file in files for place in places[file.name]]
+        check_steps(files[0].parent, [[*map(Decimal, place)] for place in numbers])
+    return [*files]
+
+
 def _ending(file: Path) -> str:
     """TIFF, PNG, DICOM or a format of RTK; empty for other files."""
     return ENDINGS.get(file.suffix.lower()) or ("DICOM" if dicom_file(file) else "")
@@ -424,66 +430,7 @@ def _dicom_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     yield from values.reshape(-1, *values.shape[-2:])[first:last]
 
 
-def _png_header(file: Path) -> Header:
-    with _png(file) as image:
-        columns, rows = image.size
-        with file.open("rb") as raw:
-            bits, colours = struct.unpack_from("BB", raw.read(26), 24)
-        chunks = dict.fromkeys((name for name, _ in _chunks(file)), "one")
-        stated = {"bit depth": bits, "colour type": colours, **chunks}
-        stated["eXIf: Orientation"] = image.getexif().get(ORIENTATION) if "eXIf" in chunks else None
-        check_keys(file, PNG_KEYS, stated.get)
-        kind = MODES.get(image.mode)
-        if kind is None or max(rows, columns) > EDGE:
-            raise Refused(
-                f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got {rows} x "
-                f"{columns} of the type {image.mode}"
-            )
-        return Header((rows, columns), np.dtype(kind), 1, frozenset([2.0**bits - 1]))
-
-
-def _png_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
-    _check_rows(file)
-    with _png(file) as image:
-        yield np.asarray(image).astype(MODES[image.mode], copy=False)
-
-
-def _check_rows(file: Path) -> None:
-    """Raise for a truncated grey PNG: Pillow leaves missing rows zero."""
-    data = file.read_bytes()
-    columns, rows, bits, interlaced = struct.unpack_from(">IIB3xB", data, 16)
-    sizes = [
-        (len(range(y, rows, down)), len(range(x, columns, right)))
-        for x, y, right, down in (INTERLACED if interlaced else PLAIN)
-    ]
-    needed = sum(m * (1 + (n * bits + 7) // 8) for m, n in sizes if n)  # a byte before each row
-    stream, got = zlib.decompressobj(), 0
-    for name, part in _chunks(file):
-        if name == "IDAT" and got < needed:
-            got += len(stream.decompress(data[part], needed - got))
-    if got < needed:
-        raise Refused(f"{file}: expected {needed} bytes of {rows} x {columns} pixels, got {got}")
-
-
-def _chunks(file: Path) -> Iterator[tuple[str, slice]]:
-    """Names of the chunks of a PNG, and the bytes of their contents."""
-    with file.open("rb") as raw:
-        raw.seek(8)
-        while len(head := raw.read(8)) == 8:
-            size, name = struct.unpack(">I4s", head)
-            yield name.decode("latin-1"), slice(raw.tell(), raw.tell() + size)
-            raw.seek(size + 4, 1)
-
-
-@contextmanager
-def _png(file: Path) -> Iterator[Any]:
-    from PIL import Image as Pillow
-
-    with Pillow.open(file, formats=["PNG"]) as image:
-        yield image
-
-
 RTK = rtk_images.ENDINGS.values()
 #: Readers of a header and of pages by format; those of others are DICOM's.
-HEADERS = {"TIFF": tiff_header, "PNG": _png_header, **dict.fromkeys(RTK, rtk_images.rtk_header)}
-PAGES = {"TIFF": tiff_pages, "PNG": _png_pages, **dict.fromkeys(RTK, rtk_images.rtk_pages)}
+HEADERS = {"TIFF": tiff_header, "PNG": png_header, **dict.fromkeys(RTK, rtk_images.rtk_header)}
+PAGES = {"TIFF": tiff_pages, "PNG": png_pages, **dict.fromkeys(RTK, rtk_images.rtk_pages)}

@@ -11,7 +11,14 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
+from mvrecon.core.files.checks import (
+    Refused,
+    as_typed,
+    check_file,
+    file_errors,
+    millimetres,
+    shown,
+)
 from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import (
     VIEW_AXES,
@@ -161,20 +168,37 @@ def hdf5_views(
             places = places._replace(angles=named(path, angles))
         if image_key is not None:
             places = places._replace(key=named(path, image_key))
-        return places.opened(path.parent.resolve())
+        return places.opened(path)
 
 
 def named(path: Path, name: str | Path) -> Place:
-    """The data set of a name in a file, or of "<file>:<name>".
+    """The data set of a name in a file, or else of "<file>:<name>".
 
     Raises:
         Refused: there is none.
     """
-    inside = IN_FILE.fullmatch(str(name))
-    file, key = (Path(inside["path"]).expanduser(), inside["name"]) if inside else (path, str(name))
+    if place := followed(path, as_typed(name), EXPECTED) or in_another(name):
+        return place
+    other, own = Path(name).expanduser(), listing(path, EXPECTED)
+    file = f"nor is there a file {other}; the first contains {own}"
+    if other.is_file():
+        file = f"and {other} is a file: name its data set by {other}:/<name>, or one of {own}"
+    raise Refused(f"{path}: has no data set {as_typed(name)}, {file}")
+
+
+def in_another(name: str | Path) -> Place | None:
+    """The data set of "<file>:<name>"; None for other texts.
+
+    Raises:
+        FileNotFoundError: the file does not exist.
+        Refused: it has no such data set.
+    """
+    if (inside := IN_FILE.fullmatch(str(name))) is None:
+        return None
+    file = Path(inside["path"]).expanduser()
     check_file(file, "an HDF5 file")
-    if (place := followed(file, key, EXPECTED)) is None:
-        raise Refused(f"{file}: has no {key}; it contains {listing(file, EXPECTED)}")
+    if (place := followed(file, inside["name"], EXPECTED)) is None:
+        raise Refused(f"{file}: has no {inside['name']}; it contains {listing(file, EXPECTED)}")
     return place
 
 
@@ -317,8 +341,9 @@ class _Layout(NamedTuple):
             flats=stated[1] or stated[0],
         )
 
-    def opened(self, folder: Path) -> FrameViews:
-        """The views, with fields and rig."""
+    def opened(self, scan: Path) -> FrameViews:
+        """The views, with fields and rig, of a scan's file."""
+        folder = scan.parent.resolve()
         frames = Frames(self.frames, folder)
         check_order(self.frames, self.axes, FRAMES)
         keys = np.zeros(frames.shape[0], int)
@@ -380,7 +405,7 @@ class _Layout(NamedTuple):
                     stacklevel=2,
                 )
         return FrameViews(
-            frames, views, fields, rig, folder, stated, *limits_of(self.detector, frames, keys)
+            frames, views, fields, rig, scan, stated, *limits_of(self.detector, frames, keys)
         )
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:

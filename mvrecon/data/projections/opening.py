@@ -8,19 +8,22 @@ from typing import Literal
 
 import numpy as np
 import torch
+from h5py import Dataset
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors
+from mvrecon.core.files.checks import Refused, as_typed, check_file, file_errors
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file, same
-from mvrecon.data.linked import values_at
+from mvrecon.data.linked import Place, followed, listing, values_at
 from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
+from mvrecon.data.projections.frames import EXPECTED, Frames, FrameViews
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
-from mvrecon.data.projections.nexus import IN_FILE, named
+from mvrecon.data.projections.nexus import IN_FILE, in_another
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import ProjectionStack
+from mvrecon.data.storage import opened
 from mvrecon.geometry.cameras.formats.common import numbers_in
 
 Layout = Literal["projections", "sinogram"]
@@ -147,8 +150,7 @@ def exposures(
     """
     if names := exposure_names(stack, path):
         values = relative_exposure(stack, _field(stack, where, "flat", flat, layout), names)
-    elif IN_FILE.fullmatch(str(path)):
-        place = named(Path(path), path)
+    elif place := _place_in(stack, path) or in_another(path):
         values = np.ravel(values_at(place, "exposures", ("units",))).astype(float)
     else:
         try:
@@ -156,12 +158,13 @@ def exposures(
         except FileNotFoundError as error:
             known = [name for name in stack.stated if exposure_names(stack, name)]
             raise FileNotFoundError(
-                f"{error}; by name, each view states {', '.join(known) or 'no exposure'}"
+                f"{error}{_absent(stack, path)}; by name, each view states "
+                f"{', '.join(known) or 'no exposure'}"
             ) from error
     if len(values) != stack.n_views or not (np.isfinite(values) & (values > 0)).all():
         raise Refused(
-            f"{path}: expected a positive exposure for each of {stack.n_views} views on disk, "
-            f"relative to the flat field's, got {len(values)} from {values.min():.4g} to "
+            f"{as_typed(path)}: expected a positive exposure for each of {stack.n_views} views on "
+            f"disk, relative to the flat field's, got {len(values)} from {values.min():.4g} to "
             f"{values.max():.4g}"
         )
     return torch.from_numpy(values).float()
@@ -258,10 +261,31 @@ def _field_at(
     views: ProjectionStack, name: str, value: str, layout: Layout | None
 ) -> ProjectionStack:
     """A field's images by their name in the views' file, or by their own path."""
-    if value.startswith("/") and not Path(value).exists():
-        if (stack := views.field_at(value)) is not None:
-            return stack
-    other = open_projections(value)
-    field = other.fields.get(name, other)  # of a scan that has one
-    stack = field if isinstance(field, ProjectionStack) else other
+    if views.scan and (place := _place_in(views, value)):
+        frames = Frames(place, views.scan.parent.resolve())
+        stack: ProjectionStack = FrameViews(frames, np.arange(frames.shape[0]))
+    else:
+        try:
+            other = open_projections(value)
+        except FileNotFoundError as error:
+            raise FileNotFoundError(f"{error}{_absent(views, value)}") from error
+        field = other.fields.get(name, other)  # of a scan that has one
+        stack = field if isinstance(field, ProjectionStack) else other
     return as_rows(stack, views.shape) if layout == "sinogram" else stack
+
+
+def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:
+    """The data set of a name in the scan's file, if any."""
+    place = None if views.scan is None else followed(views.scan, as_typed(name), EXPECTED)
+    if place is None:
+        return None
+    with opened(place.path, EXPECTED) as file:
+        return place if isinstance(file[place.name], Dataset) else None
+
+
+def _absent(views: ProjectionStack, name: str | Path) -> str:
+    """That the scan's file has no data set of a name, for messages; nothing of other views."""
+    if views.scan is None:
+        return ""
+    contained = listing(views.scan, EXPECTED)
+    return f"; {views.scan} has no data set {as_typed(name)}, it contains {contained}"

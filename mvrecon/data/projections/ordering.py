@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from decimal import Decimal
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from mvrecon.core.files.checks import Refused, shown
 
@@ -41,27 +42,32 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
 
     Raises:
         Refused: two names with the same numbers, a missing number, numbers that may be read in two
-            ways of another order (1e2, 0,5), or several kinds of names, one of which is numbered:
-            some may be references or previews.
+            ways of another order (1e2, 0,5, but not a series with 2,9 and 2,10), or several kinds
+            of names, one of which is numbered: some may be references or previews.
     """
     if len(paths) < 2:
         return list(paths)
     where, stems = paths[0].parent, [re.sub(SCIENTIFIC, "x", path.stem.lower()) for path in paths]
-    # integers only if "1.9" is followed by "1.10", a smaller decimal
-    decimals = [text for stem in stems for text in re.findall(DECIMAL, stem)]
-    places = [text.partition(".")[2] for text in decimals]
-    counted = any(len(part) > 1 and part.endswith("0") for part in places)
-    number = INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
+    number = INTEGER if _counted(DECIMAL, stems) else f"{DECIMAL}|{INTEGER}"
     mixed_up = any(re.search(SCIENTIFIC, path.stem.lower()) for path in paths)  # 1e-1 and 1e0
     number = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}{number}"
     files, parts, keys = _sorted(paths, number)
-    for other in (EXPONENT, COMMA):
+    rows = [keys[path][1::2] for path in files]
+    alike = len({tuple(part[::2]) for part in parts.values()}) == 1
+    two = alike and _counted(COMMA, stems) and not _missing(rows)  # 2,10 is no 2.1
+    readings = [rows]
+    for other in (EXPONENT,) if two else (EXPONENT, COMMA):
         found = filter(None, (re.search(other, path.stem.lower()) for path in files))
-        such = next(found, None)
-        if such and _sorted(paths, f"{other}|{number}")[0] != files:
+        if (such := next(found, None)) is None:
+            continue
+        sequence, _, values = _sorted(paths, f"{other}|{number}")
+        readings.append([values[path][1::2] for path in files])
+        if sequence != files:
             raise Refused(
                 f"{where}: expected names whose numbers can be read in one way, got {such[0]}, "
-                f"which may be one number or two, in another order; rename the files"
+                f"which may be one number or two, in another order; rename the files: decimals "
+                f"with a point and without exponents, other numbers with equally many digits "
+                f"(2,05) or another sign between them (2_5)"
             )
     columns = zip(*(part[1::2] for part in parts.values()), strict=False)
     if any(len({*texts}) > 1 and all(text[0] == "-" for text in texts) for texts in columns):
@@ -95,8 +101,8 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
                 f"{where}: expected one file of every number, got {shown(first.name)} and "
                 f"{shown(second.name)}"
             )
-    if not gaps:
-        check_steps(where, [keys[path][1::2] for path in files])  # type: ignore[misc]
+    if not gaps and all(map(_missing, readings)):
+        check_steps(where, rows)
     return files
 
 
@@ -135,12 +141,32 @@ def _move_signs(parts: Sequence[list[str]]) -> None:
                 part[k], part[k + 1] = part[k][:-1], part[k][-1] + part[k + 1]
 
 
-def check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
+def _counted(pattern: str, stems: Sequence[str]) -> bool:
+    """Whether numbers of a pattern of decimals in names are pairs of integers: "1.9" is followed by
+    "1.10", a smaller decimal.
+    """
+    places = [re.split("[.,]", text)[1] for stem in stems for text in re.findall(pattern, stem)]
+    ends = any(len(part) > 1 and part.endswith("0") for part in places)
+    return ends and len({*map(len, places)}) > 1
+
+
+def check_steps(where: Path, numbers: Sequence[Sequence[Any]]) -> None:
     """Raise if a view is missing between others.
 
     A number that is unique to every file must have equal steps, or one of several such numbers
     (index and angle); else the files must be a complete table of combinations.
     """
+    if got := _missing(numbers):
+        raise Refused(
+            f"{where}: expected {got}; is a file missing? Where views were left out on purpose: "
+            f"gaps=true"
+        )
+
+
+def _missing(numbers: Sequence[Sequence[Any]]) -> str:
+    """What is missing in names of these decimals, for messages; nothing of a complete series."""
+    if len({*map(len, numbers)}) > 1:
+        return "equally many numbers in every name"
     columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
     running = [column for column in columns if len(column) > 1]
     serial = [column for column in running if len(column) == len(numbers)]
@@ -152,15 +178,11 @@ def check_steps(where: Path, numbers: Sequence[Sequence[Decimal]]) -> None:
         rounding = min(2 * digit, least / 2) if digit < 1 else 0
         jumps += [(a, b) for a, b in pairs if b - a > least + rounding][:1]
     if jumps and len(jumps) >= len(serial):
-        raise Refused(
-            f"{where}: expected views numbered in equal steps, got {jumps[0][0]} and then "
-            f"{jumps[0][1]}; is a file missing? Where views were left out on purpose: gaps=true"
-        )
+        return f"views numbered in equal steps, got {jumps[0][0]} and then {jumps[0][1]}"
     if not serial and math.prod(map(len, columns)) > len(numbers):
         known = {tuple(row) for row in numbers}
         absent = next(row for row in product(*columns) if row not in known)
-        raise Refused(
-            f"{where}: expected a view of each combination of the numbers, got none of "
-            f"{', '.join(map(str, absent))}; is a file missing? Where views were left out on "
-            f"purpose: gaps=true"
+        return (
+            f"a view of each combination of the numbers, got none of {', '.join(map(str, absent))}"
         )
+    return ""

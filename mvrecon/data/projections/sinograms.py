@@ -29,16 +29,12 @@ class Sinograms(ProjectionStack):
             name: as_rows(field, self.shape) if isinstance(field, ProjectionStack) else field
             for name, field in slices.fields.items()
         }
-        self.rig, self.mirrored = slices.rig, slices.mirrored
-        self.negative_is_bad = slices.negative_is_bad
+        self.rig, self.mirrored, self.scan = slices.rig, slices.mirrored, slices.scan
+        self.excluded = None if slices.excluded is None else 0
 
     @property
     def top(self) -> float | None:
         return self._top
-
-    def field_at(self, name: str) -> ProjectionStack | None:
-        field = self._slices.field_at(name)
-        return None if field is None else as_rows(field, self.shape)
 
     @cached_property
     def _values(self) -> np.ndarray:

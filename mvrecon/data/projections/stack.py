@@ -4,6 +4,7 @@ cameras alike.
 """
 
 import math
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
@@ -34,12 +35,17 @@ MU_FILE = "mu.nii.gz"
 READ_PIXELS = 2**24
 
 
+#: A place in a set of files: the number of the image, and of the plane along C, Z and T.
+PlaceInSet = tuple[int, ...]
+
+
 class Header(NamedTuple):
     """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
     these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
     have in common, those on which grey values or places depend, by their names a text for each
-    page, whether values are stated to be in proportion to intensity, and, where negative values
-    mark bad pixels, how many of these the file states.
+    page, whether values are stated to be in proportion to intensity, where negative values mark bad
+    pixels, how many of these the file states, and, of a set of files, the place of each page by the
+    file's name.
     """
 
     shape: tuple[int, int]
@@ -51,6 +57,7 @@ class Header(NamedTuple):
     stated: Mapping[str, Sequence[str]] = {}
     linear: bool = False
     excluded: int | None = None
+    places: Mapping[str, Sequence[PlaceInSet]] = {}
 
     @property
     def words(self) -> str:
@@ -96,8 +103,11 @@ class ProjectionStack(ABC):
     affine: np.ndarray | None = None
     #: Whether views, and fields beside them, are stored as seen from the detector's back.
     mirrored: bool = False
-    #: Whether negative values mark pixels that a view could not measure.
-    negative_is_bad: bool = False
+    #: The HDF5 file of the scan, in which options may name further data sets.
+    scan: Path | None = None
+    #: Where negative values mark pixels that a view could not measure: the number of those that the
+    #: files state for all views.
+    excluded: int | None = None
     #: Flat and dark fields that the file itself has, by "flat" and "dark".
     fields: Mapping[str, "ProjectionStack | float"] = {}
     #: Exposure, beam and places that the files state, by name: a text for each view, "" of none.
@@ -135,8 +145,22 @@ class ProjectionStack(ABC):
 
     @property
     def marked(self) -> Bool[Tensor, "v u"] | None:
-        """Pixels that the files mark as bad; None if they mark none."""
-        return None
+        """Pixels that the files mark as bad in all views: those that are negative in the first;
+        None if they mark none.
+
+        Warns:
+            UserWarning: the files state more.
+        """
+        if self.excluded is None:
+            return None
+        marked = self.read(0, 1)[0] < 0
+        if marked.sum() < self.excluded:
+            warnings.warn(
+                f"{self.path}: expected as many negative pixels as N_excluded_pixels states, "
+                f"{self.excluded}, got {int(marked.sum())}; give the others as views.bad_pixels",
+                stacklevel=2,
+            )
+        return marked
 
     def exposure(self, *names: str) -> Float[np.ndarray, " m"] | None:
         """The product of what files state of each view by names; None unless all are numbers."""
@@ -145,10 +169,6 @@ class ProjectionStack(ABC):
             return np.prod([[float(text) for text in one] for one in texts], axis=0)
         except ValueError:
             return None
-
-    def field_at(self, name: str) -> "ProjectionStack | None":
-        """The images at a name inside the file; None if it has no such name."""
-        return None
 
     def check_rig(self, cameras: Cameras) -> None:
         """Compare cameras, one for each view, with what the file states of them.

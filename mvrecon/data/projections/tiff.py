@@ -3,17 +3,17 @@
 import math
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, Refused, shown
+from mvrecon.core.files.checks import EDGE, Refused, shown, text_of
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.data.projections import descriptions
-from mvrecon.data.projections.stack import VIEWS, Header
+from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
 #: Tags of EXIF on which grey values depend, but not in a proportion that all cameras share.
 EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureBiasValue")
@@ -74,7 +74,11 @@ TIFF_KEYS = (
         "compared",
         "tifffile's, with its shape: views of which no page has a directory",
     ),
-    Key("ImageDescription: TiffData", "compared", "OME's, with the order of the pages"),
+    Key(
+        "ImageDescription: TiffData",
+        "compared",
+        "OME's, with the order of the pages; of a set of files, it is their order",
+    ),
     Key(
         "ImageDescription: channels, ImageDescription: slices, ImageDescription: frames, "
         "ImageDescription: SizeC, ImageDescription: SizeZ, ImageDescription: SizeT",
@@ -116,15 +120,29 @@ def tiff_header(file: Path) -> Header:
                     f"{page.index}"
                 )
             numbers.append(page.tags.valueof("PageNumber"))
-        _check_order(file, pages[0].description, numbers, images)
+        text = _description(file, descriptions.without_own_id(pages[0].description))
+        places = descriptions.places_in_set(text)
+        _check_order(file, text, numbers, images, places)
         stated *= images // len(pages)
         names = dict.fromkeys(name for one in stated for name in one)
         texts = {name: [one.get(name, "") for one in stated] for name in names}
         head = first._replace(stated=texts)
-        first = descriptions.of_file(file, head, pages[0].description)
+        first = descriptions.of_file(file, head, text, places)._replace(places=places)
     if _offset(pages[0]):
         return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return first
+
+
+def _description(file: Path, text: str) -> str:
+    """The description of a file, where OME states that it is in another one beside it: that."""
+    for _, stated in descriptions.elements(text, "BinaryOnly"):
+        other = file.with_name(Path(stated.get("MetadataFile", "")).name or file.name)
+        if other != file and other.is_file():
+            if other.suffix.lower() not in (".tif", ".tiff"):
+                return text_of(other)
+            with _tiff(other) as (pages, _):
+                return descriptions.without_own_id(pages[0].description)
+    return text
 
 
 def _check_tags(file: Path, page: Any) -> None:
@@ -170,14 +188,27 @@ def _behind(pages: Any, images: int) -> bool:
 
 
 def _check_order(
-    file: Path, text: str, numbers: Sequence[tuple[int, ...] | None], images: int
+    file: Path,
+    text: str,
+    numbers: Sequence[tuple[int, ...] | None],
+    images: int,
+    places: Mapping[str, Sequence[PlaceInSet]],
 ) -> None:
     """Raise for pages that are not in the order of one axis, by the description of the first and
-    the PageNumbers of all.
+    the PageNumbers of all; of a file of a set, for other pages than those with places in it.
     """
     known = [number[0] for number in numbers if number]
     if known != sorted(known):
         raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
+    if places:
+        if len(own := places.get(file.name, ())) != images:
+            raise Refused(
+                f"{file}: expected a place of each of its {images} images in the set of "
+                f"{len(places)} files that its ImageDescription names ({min(places)}, ...), got "
+                f"{len(own)}; was it renamed, or cut? Where its name has the right order, save it "
+                f"without that description"
+            )
+        return
     if not ("ImageJ" in text or descriptions.OME.search(text)):
         return
     axes = [(a or c, int(b or d)) for a, b, c, d in AXES.findall(text)]
@@ -194,7 +225,7 @@ def _check_order(
         )
     planes = sorted(
         (int(place.get("IFD", 0)), sum(int(place.get(f"First{axis}", 0)) for axis in "ZCT"))
-        for place in descriptions.elements(text, "TiffData")
+        for _, place in descriptions.elements(text, "TiffData")
     )
     if planes != sorted(planes, key=lambda plane: plane[1]):
         raise Refused(

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.atomic import PART_ENDING
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.stack import VIEWS
 
@@ -129,7 +130,7 @@ def _write(path: Path, grey: Float[Tensor, "v u"]) -> None:
 @contextmanager
 def _folder_written_whole(folder: Path) -> Iterator[Path]:
     """Context of a temporary folder that is renamed to `folder` on success."""
-    part = folder.with_name(f".{folder.name}.{os.getpid()}.unfinished")
+    part = folder.with_name(f".{folder.name}.{os.getpid()}{PART_ENDING}")
     part.mkdir(parents=True)
     try:
         yield part

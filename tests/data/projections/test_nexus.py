@@ -783,6 +783,20 @@ def test_frames_of_two_names_are_those_of_the_detector(link, tmp_path):
         assert views.stack.rig["detector"] == {"pixel_mm": (2e-3, 3e-3)}
 
 
+@pytest.mark.parametrize("many", [1, 4])
+def test_a_chunk_may_be_one_frame_of_any_size(many, tmp_path, monkeypatch):
+    """Which is read at once anyway; of larger ones the command is named that makes them smaller."""
+    monkeypatch.setattr(storage, "MAX_CHUNK_BYTES", ROWS * COLUMNS)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("raw", data=grey(), chunks=(many, ROWS, COLUMNS), compression="gzip")
+    if many == 1:
+        views = opened(tmp_path / "a.h5", dataset="raw", flat=FLAT)
+        assert np.array_equal(views.stack.read(0, VIEWS), grey())
+        return
+    with pytest.raises(Refused, match=r"at most 96 bytes .* h5repack -l /raw:CHUNK=1x6x8 writes"):
+        opened(tmp_path / "a.h5", dataset="raw", flat=FLAT).whole()
+
+
 def test_an_option_of_hdf5_for_another_file_is_refused(tmp_path):
     np.save(tmp_path / "a.npy", grey())
     with pytest.raises(Refused, match=r"for views\.angles"):

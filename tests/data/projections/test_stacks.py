@@ -13,9 +13,9 @@ from PIL import Image as Pillow
 
 from mvrecon.core import machine as memory
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.projections.images import INTERLACED, PLAIN
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.ordering import ordered
+from mvrecon.data.projections.png import INTERLACED, PLAIN
 from mvrecon.data.volume_files import read_volume
 from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
 
@@ -293,11 +293,41 @@ def test_numbers_with_exponents_decide_the_order(names, tmp_path):
         (["3e9", "12e1"], "3e9"),
         (["p_0,0", "p_0,25", "p_0,5"], "0,0"),
         (["p_1,5", "p_1,25"], "1,5"),
+        (["p_2,8", "p_2,9", "p_2,11"], "2,8"),
+        (["p_0,5", "p_0,50", "p_0,25", "p_1,0"], "0,5"),
+        (["p_0,0", "p_0,250", "p_0,5", "p_0,10"], "0,0"),
+        (["a_1e1_2,9", "a_1e2_2,10", "a_5e1_2,11"], "1e1"),
     ],
 )
-def test_numbers_that_can_be_read_in_two_orders_are_refused(names, such, tmp_path):
-    with pytest.raises(Refused, match=f"read in one way, got {such}, which may be"):
-        ordered([tmp_path / f"{name}.tif" for name in names])
+@pytest.mark.parametrize("gaps", [False, True])
+def test_numbers_that_can_be_read_in_two_orders_are_refused(names, such, gaps, tmp_path):
+    """And say how to rename the files; decimals with a trailing zero are no series of integers."""
+    words = f"read in one way, got {such}, which may be .* equally many digits"
+    with pytest.raises(Refused, match=words):
+        ordered([tmp_path / f"{name}.tif" for name in names], gaps)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"a2,{k}" for k in range(1, 13)],
+        [f"p_2,{k}" for k in range(8, 12)],
+        [f"{row},{k}" for row in (1, 2) for k in range(1, 12)],
+        [f"{row},{k}" for row in range(8, 11) for k in range(8, 11)],
+        [f"2,{k} b" for k in range(0, 30, 5)],
+        [f"a2,{k:02}" for k in range(1, 13)],
+        ["p_0,00", "p_0,25", "p_0,50", "p_0,75", "p_1,00"],
+        ["p_0,0", "p_0,5", "p_1,0", "p_1,5"],
+        [f"1e{k}" for k in range(1, 13)],
+        [f"1e{k:02}" for k in range(1, 13)],
+    ],
+)
+def test_numbers_with_a_comma_that_are_a_series_in_one_way_are_read(names, tmp_path):
+    """2,9 is followed by 2,10, which is no decimal; decimals of equally many digits, and powers of
+    ten, have one order in either way.
+    """
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    assert ordered(paths[::-1]) == paths
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,103 @@
+"""Projections as PNG, by Pillow."""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvrecon.core.files.checks import EDGE, Refused
+from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.data.projections.stack import Header
+
+#: Pixel types of a grey PNG by Pillow's mode.
+MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
+#: Tag of EXIF for the order of rows and columns.
+ORIENTATION = 274
+#: Chunks and fields of PNG that change the pixels.
+PNG_KEYS = (
+    Key("bit depth", "refused", "Pillow rescales fewer bits", (8, 16)),
+    Key("colour type", "refused", "grey values", (0,)),
+    Key("interlace method", "applied"),
+    Key("acTL", "refused", "one image in each file"),
+    Key("pCAL", "refused", "store the values that the calibration gives"),
+    Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
+    Key("gAMA, sRGB, iCCP, cICP, cHRM, tRNS", "ignored", "display alone"),
+    Key("pHYs, oFFs, sCAL", "ignored", "origin and print size"),
+    Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
+)
+#: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
+PLAIN, INTERLACED = (
+    [(0, 0, 1, 1)],
+    [
+        (0, 0, 8, 8),
+        (4, 0, 8, 8),
+        (0, 4, 4, 8),
+        (2, 0, 4, 4),
+        (0, 2, 2, 4),
+        (1, 0, 2, 2),
+        (0, 1, 1, 2),
+    ],
+)
+
+
+def png_header(file: Path) -> Header:
+    with _png(file) as image:
+        columns, rows = image.size
+        with file.open("rb") as raw:
+            bits, colours = struct.unpack_from("BB", raw.read(26), 24)
+        chunks = dict.fromkeys((name for name, _ in _chunks(file)), "one")
+        stated = {"bit depth": bits, "colour type": colours, **chunks}
+        stated["eXIf: Orientation"] = image.getexif().get(ORIENTATION) if "eXIf" in chunks else None
+        check_keys(file, PNG_KEYS, stated.get)
+        kind = MODES.get(image.mode)
+        if kind is None or max(rows, columns) > EDGE:
+            raise Refused(
+                f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got {rows} x "
+                f"{columns} of the type {image.mode}"
+            )
+        return Header((rows, columns), np.dtype(kind), 1, frozenset([2.0**bits - 1]))
+
+
+def png_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
+    _check_rows(file)
+    with _png(file) as image:
+        yield np.asarray(image).astype(MODES[image.mode], copy=False)
+
+
+def _check_rows(file: Path) -> None:
+    """Raise for a truncated grey PNG: Pillow leaves missing rows zero."""
+    data = file.read_bytes()
+    columns, rows, bits, interlaced = struct.unpack_from(">IIB3xB", data, 16)
+    sizes = [
+        (len(range(y, rows, down)), len(range(x, columns, right)))
+        for x, y, right, down in (INTERLACED if interlaced else PLAIN)
+    ]
+    needed = sum(m * (1 + (n * bits + 7) // 8) for m, n in sizes if n)  # a byte before each row
+    stream, got = zlib.decompressobj(), 0
+    for name, part in _chunks(file):
+        if name == "IDAT" and got < needed:
+            got += len(stream.decompress(data[part], needed - got))
+    if got < needed:
+        raise Refused(f"{file}: expected {needed} bytes of {rows} x {columns} pixels, got {got}")
+
+
+def _chunks(file: Path) -> Iterator[tuple[str, slice]]:
+    """Names of the chunks of a PNG, and the bytes of their contents."""
+    with file.open("rb") as raw:
+        raw.seek(8)
+        while len(head := raw.read(8)) == 8:
+            size, name = struct.unpack(">I4s", head)
+            yield name.decode("latin-1"), slice(raw.tell(), raw.tell() + size)
+            raw.seek(size + 4, 1)
+
+
+@contextmanager
+def _png(file: Path) -> Iterator[Any]:
+    from PIL import Image as Pillow
+
+    with Pillow.open(file, formats=["PNG"]) as image:
+        yield image

@@ -1,0 +1,145 @@
+"""Options of views name what the scan's file contains, else a file, with or without a slash, as
+typed in any folder: on a command line, in a scan.yaml and in Python.
+"""
+
+import os
+
+import h5py
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from mvrecon.apps.config import absolute_paths
+from mvrecon.apps.scan_file import NAME, expanded, save
+from mvrecon.apps.settings import ReconstructSettings
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.opening import open_projections
+from mvrecon.data.projections.views import Measured, MeasuredViews
+from tests.data.projections.conftest import VIEWS, grey, images
+from tests.data.projections.test_nexus import ANGLES, DARK, FLAT, KEYS, frames, integrals
+
+#: Exposures of the views relative to the flat field's.
+EXPOSURES = np.linspace(0.5, 2, VIEWS)
+NAMED = {"dataset": "raw/frames", "flat": "raw/open", "dark": "shut", "angles": "turn"}
+KEYED = {"dataset": "raw/all", "image_key": "raw/keys", "angles": "turn"}
+
+
+@pytest.fixture
+def scan(tmp_path):
+    """An HDF5 file of a layout of its own."""
+    with h5py.File(tmp_path / "scan.h5", "w") as file:
+        file["raw/frames"], file["raw/open"] = grey(), np.full(grey().shape[1:], FLAT, "u2")
+        file["shut"], file["turn"] = np.full(grey().shape[1:], DARK, "u2"), ANGLES
+        file["raw/all"], file["raw/keys"] = frames(), KEYS
+        file["light"], file["group/inner"] = EXPOSURES, 1
+    return tmp_path / "scan.h5"
+
+
+def typed(folder, views):
+    """The views of options as typed on a command line in a folder."""
+    here = os.getcwd()
+    os.chdir(folder)
+    try:
+        settings = absolute_paths({"views": views}, ReconstructSettings)
+    finally:
+        os.chdir(here)  # the task may run elsewhere
+    return MeasuredViews(Measured(**settings["views"]))
+
+
+def told(folder, views):
+    """The views of options in a scan.yaml, of which a copy is written elsewhere."""
+    (folder / NAME).write_text(yaml.safe_dump({"views": views}))
+    words = dict(word.split("=", 1) for word in expanded([f"scan={folder}"]))
+    settings = {key.removeprefix("views."): text for key, text in words.items()}
+    (folder / "copy").mkdir(exist_ok=True)
+    save(folder / "copy" / NAME, {"views": settings})
+    words = dict(word.split("=", 1) for word in expanded([f"scan={folder / 'copy'}"]))
+    again = {key.removeprefix("views."): text for key, text in words.items()}
+    return typed(folder / "copy", again)
+
+
+@pytest.mark.parametrize("way", [typed, told])
+@pytest.mark.parametrize("slash", ["", "/"])
+@pytest.mark.parametrize("names", [NAMED, KEYED], ids=["named", "keyed"])
+def test_names_inside_the_scans_file_need_no_slash(names, slash, way, scan):
+    """Also tried: names with a dot, which is no ending here, and of the file's own folder."""
+    views = way(scan.parent, {"path": "scan.h5", **{k: slash + n for k, n in names.items()}})
+    expected = torch.from_numpy(integrals()).float()
+    assert torch.allclose(views.whole().views, expected, atol=2e-6)
+    assert np.allclose(views.stack.rig["angles"], ANGLES)
+
+
+@pytest.mark.parametrize("way", [typed, told])
+@pytest.mark.parametrize("name", ["light", "/light", "scan.h5:/light", "light.npy", "light.csv"])
+def test_exposures_are_named_as_all_others(name, way, scan):
+    np.save(scan.with_name("light.npy"), EXPOSURES)
+    rows = "\n".join(f"{k},{x!r}" for k, x in enumerate(EXPOSURES.tolist()))
+    scan.with_name("light.csv").write_text(f"view,exposure\n{rows}\n")
+    views = way(scan.parent, {"path": "scan.h5", **NAMED, "exposure": name})
+    assert torch.allclose(views.exposure, torch.from_numpy(EXPOSURES).float())
+
+
+@pytest.mark.parametrize("way", [typed, told])
+def test_a_data_set_of_the_scan_comes_before_a_file_of_its_name(way, scan):
+    """But not a group of this name, which is no data set."""
+    for name in ("shut", "group"):
+        images(scan.with_name(name), np.full((2, *grey().shape[1:]), DARK + 9, "u2"))
+    dark = way(scan.parent, {"path": "scan.h5", **NAMED}).fields.dark
+    assert (dark == DARK).all()
+    dark = way(scan.parent, {"path": "scan.h5", **NAMED, "dark": "group"}).fields.dark
+    assert (dark == DARK + 9).all()
+
+
+def test_a_file_that_the_scan_does_not_contain_is_read(scan):
+    """Of images, by an absolute path, one that begins at home, and in Python."""
+    folder = images(scan.with_name("darks"), np.full((2, *grey().shape[1:]), DARK, "u2"))
+    for dark in ("darks", str(folder), "./darks", f"../{scan.parent.name}/darks"):
+        views = typed(scan.parent, {"path": "scan.h5", **NAMED, "dark": dark})
+        assert (views.fields.dark == DARK).all()
+    options = {**NAMED, "dark": folder}
+    assert (MeasuredViews(Measured(path=scan, **options)).fields.dark == DARK).all()
+
+
+@pytest.mark.parametrize("key", ["dataset", "angles", "image_key", "flat", "dark", "exposure"])
+def test_what_is_neither_is_refused_by_both_places(key, scan):
+    """With what the scan's file contains."""
+    options = {"path": "scan.h5", **NAMED, key: "raw/none"}
+    with pytest.raises((Refused, FileNotFoundError)) as caught:
+        typed(scan.parent, options).fields  # noqa: B018
+    message = str(caught.value)
+    assert "scan.h5" in message and "raw/none" in message and "/raw/frames (12, 6, 8)" in message
+    assert "/./" not in message
+    assert "no such file" in message or "nor is there a file" in message
+
+
+@pytest.mark.parametrize("key", ["dataset", "angles", "image_key"])
+def test_a_file_without_a_name_inside_says_what_is_missing(key, scan):
+    with h5py.File(scan.with_name("b.h5"), "w") as file:
+        file["x"] = ANGLES
+    name = "b.h5" if key != "dataset" else str(scan.with_name("b.h5"))
+    with pytest.raises(Refused, match=r"b.h5 is a file: .*b.h5:/<name>"):
+        typed(scan.parent, {"path": "scan.h5", **NAMED, key: name})
+
+
+def test_names_are_those_of_the_scans_file_whose_frames_are_in_another(scan):
+    """A file of links, as beamlines write, has flats and exposures of its own."""
+    with h5py.File(scan.with_name("links.nxs"), "w") as file:
+        file["frames"] = h5py.ExternalLink("scan.h5", "/raw/frames")
+        file["white"], file["turn"] = np.full(grey().shape[1:], FLAT, "u2"), ANGLES
+        file["dose"] = EXPOSURES
+        file["black"] = h5py.ExternalLink("scan.h5", "/shut")
+    options = {"dataset": "frames", "angles": "turn", "flat": "white", "dark": "black"}
+    views = typed(scan.parent, {"path": "links.nxs", **options, "exposure": "dose"})
+    assert (views.fields.dark == DARK).all()
+    assert torch.allclose(views.exposure, torch.from_numpy(EXPOSURES).float())
+
+
+def test_options_of_other_formats_are_files_alone(tmp_path):
+    images(tmp_path / "scan", grey())
+    images(tmp_path / "darks", np.full((2, *grey().shape[1:]), DARK, "u2"))
+    views = typed(tmp_path, {"path": "scan", "flat": FLAT, "dark": "darks"})
+    assert (views.fields.dark == DARK).all()
+    with pytest.raises(FileNotFoundError, match="none: no such file or folder"):
+        typed(tmp_path, {"path": "scan", "flat": float(FLAT), "dark": "none"})
+    assert open_projections(tmp_path / "scan").scan is None
