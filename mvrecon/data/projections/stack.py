@@ -84,8 +84,8 @@ class ProjectionStack(ABC):
     total_s: float | None = None
     #: When the measurement began, if stored.
     began: datetime | None = None
-    #: Width of the energy window in keV, if stored.
-    width_kev: float | None = None
+    #: Limits of the energy window in keV, if stored.
+    window_kev: tuple[float, float] | None = None
     #: Start of each view in s since that of the measurement, if stored.
     starts_s: Sequence[float] | None = None
     #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.

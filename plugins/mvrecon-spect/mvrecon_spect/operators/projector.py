@@ -109,7 +109,7 @@ class Spect(Scaled):
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
-        found = response_of(response, hole, cameras, blur, intrinsic_mm)
+        found = response_of(response, hole, cameras, grid, blur, intrinsic_mm)
         support = check_support(options.get("support"), grid)
         attenuation, weight = CaseAttenuation.of(mu), None
         if (method := options.pop("method", FOOTPRINTS)) == FOOTPRINTS:

@@ -8,6 +8,7 @@ images along the tangent of the angle to the axis.
 
 import csv
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,15 +60,24 @@ ResponseOption = Literal["geometric"] | str | Path | Mapping[str, Any]
 
 #: Angles at which parts of a response are evaluated, between the axis and a detector's corner.
 ANGLES = 33
+#: Least difference of magnifications, relative to the greatest, and of angles in degrees, for a
+#: further term of a table's polynomials.
+APART, DEGREES_APART = 0.05, 3.0
+#: Magnifications beyond those of a table, as a ratio, from which a warning is given; points of a
+#: grid, along each axis, where its polynomials are evaluated.
+MAX_BEYOND, PLACES = 1.25, 9
 #: Columns of a table of a measured response.
 TABLE = ("depth_mm", "angle_degrees", "fwhm_radial_mm", "fwhm_tangential_mm")
-OPTIONAL = ("distance_mm", "efficiency")
+OPTIONAL = ("distance_mm", "efficiency", "area_mm2")
+#: Relative difference of the areas of a hole, for rounding.
+MAX_AREA_DIFFERENCE = 0.01
 
 
 def response_of(
     option: ResponseOption,
     hole: Hole,
     cameras: Cameras,
+    grid: Grid,
     blur: bool = True,
     intrinsic_mm: float = 0.0,
 ) -> Response:
@@ -79,6 +89,7 @@ def response_of(
             the path of a table, see `measured`.
         hole: a pinhole with its penetration.
         cameras: the pinholes.
+        grid: the voxels, which a table must cover.
         blur: whether there is any.
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
 
@@ -112,7 +123,7 @@ def response_of(
             f"Expected no intrinsic FWHM with a measured response, which contains it, got "
             f"{intrinsic_mm} mm"
         )
-    return measured(Path(option), cameras)
+    return measured(Path(option), hole, cameras, grid)
 
 
 def geometric(hole: Hole, intrinsic_mm: float) -> Response:
@@ -197,20 +208,29 @@ def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
     return torch.linalg.lstsq(powers, values[:, None]).solution[:, 0]
 
 
-def measured(path: Path, cameras: Cameras) -> Response:
+def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
     """A response from widths of the images of point sources, of Gaussian shape.
 
     Args:
         path: a table with a row for each source: its distance `depth_mm` from the hole's plane and
             `angle_degrees` from the axis, `fwhm_radial_mm` and `fwhm_tangential_mm` of its image on
-            the detector, and optionally `efficiency`, counts over those of the law, and
+            the detector, and optionally `efficiency`, counts over those of the law, `area_mm2`,
+            that of the hole in this law, which is compared, and
             `distance_mm` l from hole to detector, if that is not of all cameras. Variances are
             fitted in l / depth and 1 - cos, of as many terms as there are depths and
-            angles, at most three and two.
+            angles that differ by `APART` and `DEGREES_APART`, at most three and two.
+        hole: its sensitivity is the law's.
         cameras: a rig with one distance from hole to detector, unless the table has it.
+        grid: the voxels.
 
     Raises:
-        ValueError: missing or unknown columns, impossible values, or several distances.
+        ValueError: missing or unknown columns, impossible values, several distances, efficiencies
+            of another hole, or widths or
+            efficiencies of voxels in a detector's field that are not positive, beyond the table's
+            depths and angles.
+
+    Warns:
+        UserWarning: voxels far beyond the table's depths.
     """
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -236,12 +256,21 @@ def measured(path: Path, cameras: Cameras) -> Response:
     else:
         lengths = lengths[0].expand_as(depth)
     positive = torch.stack([depth, radial, tangential, lengths])
-    if not (positive > 0).all() or not (angle.abs() < 90).all() or not positive.isfinite().all():
-        raise ValueError(f"{path}: expected positive mm, and angles below 90 degrees")
+    numbers = torch.tensor([*columns.values()], dtype=torch.float64)
+    if not (positive > 0).all() or not (angle.abs() < 90).all() or not numbers.isfinite().all():
+        raise ValueError(f"{path}: expected finite, positive mm, and angles below 90 degrees")
+    for area in set(columns.get("area_mm2", ())):
+        if not abs(area / hole.area_mm2 - 1) <= MAX_AREA_DIFFERENCE:
+            raise ValueError(
+                f"{path}: expected the hole of its efficiencies, of {area:g} mm^2 "
+                f"({math.sqrt(4 * area / math.pi):.3g} mm wide if round), got one of "
+                f"{hole.area_mm2:.4g} mm^2 with its penetration; set the diameter, and no "
+                f"collimator_mu, which measured efficiencies contain"
+            )
     m, cosine = lengths / depth, torch.deg2rad(angle).cos()
     t, tangent2 = 1 - cosine, 1 / cosine**2 - 1
-    depths, angles = min(len(m.unique()), 3), min(len(angle.abs().unique()), 2)
-    used = [3 * j + i for j in range(angles) for i in range(depths)]
+    depths, angles = _apart(m, APART * m.max().item()), _apart(angle.abs(), DEGREES_APART)
+    used = [3 * j + i for j in range(min(angles, 2)) for i in range(min(depths, 3))]
     terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)[:, used]
 
     def fitted(values: Tensor, rows: Tensor) -> tuple[float, ...]:
@@ -251,13 +280,62 @@ def measured(path: Path, cameras: Cameras) -> Response:
 
     detector = fitted((tangential / FWHM) ** 2, terms)
     more = (radial**2 - tangential**2) / FWHM**2
-    smear = fitted(more, terms * tangent2[:, None]) if angles > 1 else (0.0,) * 6
+    oblique = angle.abs().max() >= DEGREES_APART  # on the axis, radial is no direction
+    smear = fitted(more, terms * tangent2[:, None]) if oblique else (0.0,) * 6
     efficiency = (1.0, 0.0, 0.0)
     if "efficiency" in columns:
         values = torch.tensor(columns["efficiency"], dtype=torch.float64)
-        fit = _polynomial(t, values, min(len(angle.abs().unique()), 3)).tolist()
+        fit = _polynomial(t, values, min(angles, 3)).tolist()
         efficiency = (*fit, 0.0, 0.0)[:3]
-    return Response(detector=detector, radial=smear, efficiency=efficiency)
+    response = Response(detector=detector, radial=smear, efficiency=efficiency)
+    _check_covered(path, response, cameras, grid, m)
+    return response
+
+
+def _apart(values: Float[Tensor, " n"], least: float) -> int:
+    """How many of the values, from the least up, differ by so much from the one before."""
+    count, last = 0, -math.inf
+    for value in values.sort().values.tolist():
+        if value - last >= least:
+            count, last = count + 1, value
+    return count
+
+
+@torch.no_grad()
+def _check_covered(
+    path: Path, response: Response, cameras: Cameras, grid: Grid, known: Float[Tensor, " n"]
+) -> None:
+    """Check a table's response at points of the grid in the field of each detector; see
+    `measured`.
+    """
+    axes = [torch.linspace(0, n - 1, PLACES, dtype=torch.float64) for n in grid.size]
+    images = cameras.project(grid.to_world(torch.cartesian_prod(*axes)).to(cameras.source))
+    pixels, length = images[..., :2], cameras.distance[:, None]
+    end = pixels.new_tensor(cameras.shape[::-1]) - 0.5
+    seen = (images[..., 2] < 0) & ((pixels > -0.5) & (pixels < end)).all(dim=-1)
+    steps = torch.stack([cameras.u, cameras.v], dim=1)
+    beam = pixels @ steps + (cameras.origin - cameras.source)[:, None]
+    tangents = beam @ (steps / steps.norm(dim=-1, keepdim=True)).mT / length[..., None]
+    m, t = (length / -images[..., 2])[seen], (1 - length / beam.norm(dim=-1))[seen]
+    powers = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)
+    detector, radial = (powers @ m.new_tensor(c) for c in (response.detector, response.radial))
+    variance = detector[:, None] + radial[:, None] * tangents[seen] ** 2
+    efficiency = torch.stack([t**0, t, t**2], dim=1) @ m.new_tensor(response.efficiency)
+    good = (variance > 0).all(dim=1) & (efficiency > 0)
+    about = f"its magnifications, l / depth, are {known.min():.3g} to {known.max():.3g}"
+    if not good.all():
+        bad = m[~good]
+        raise ValueError(
+            f"{path}: expected positive widths and efficiencies of all voxels in the detectors' "
+            f"fields, got others at magnifications of {bad.min():.3g} to {bad.max():.3g}; {about}: "
+            f"add sources there, or make the grid smaller"
+        )
+    if m.numel() and (m.max() > MAX_BEYOND * known.max() or MAX_BEYOND * m.min() < known.min()):
+        warnings.warn(
+            f"{path}: {about}, those of the grid {m.min():.3g} to {m.max():.3g}; widths there are "
+            f"extrapolated",
+            stacklevel=2,
+        )
 
 
 def record_of(
@@ -282,8 +360,7 @@ def record_of(
     secant = torch.stack(products, dim=1) / length[:, None] ** 2
     pitch = torch.stack([u.norm(dim=1), v.norm(dim=1)], dim=1)
     feet = torch.stack([_dot(foot, u), _dot(foot, v)], dim=1) / pitch**2
-    width, height = hole.effective_mm
-    area = width * height / 16 if hole.round else width * height / (4 * math.pi)
+    area = hole.area_mm2 / (4 * math.pi)
     degrees = hole.acceptance_degrees
     least = -1.0 if degrees is None else math.cos(math.radians(degrees))
     every = torch.ones_like(length)[:, None]
