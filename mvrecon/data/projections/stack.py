@@ -78,6 +78,8 @@ class ProjectionStack(ABC):
     unit: str | None = None
     #: Expected counts per this unit, by which counts are divided; None: none is known.
     dose: float | None = None
+    #: Whether the unit is that of one count, which is another activity in another measurement.
+    own_unit: bool = False
     #: Duration of the measurement in s, if stored.
     duration_s: float | None = None
     #: Duration of all views together in s, if stored instead.

@@ -24,6 +24,9 @@ class InterfileViews(ProjectionStack):
     """
 
     kind = "counts"
+    unit = "spect of activity"
+    dose = 1.0
+    own_unit = True
 
     def __init__(self, path: Path):
         header = read_header(path, "projections")

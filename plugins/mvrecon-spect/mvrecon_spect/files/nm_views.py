@@ -54,6 +54,9 @@ class NmViews(ProjectionStack):
     """
 
     kind = "counts"
+    unit = "spect of activity"
+    dose = 1.0
+    own_unit = True
 
     def __init__(self, path: Path, dataset: str | None = None):
         frames, studies = zip(*read_frames(path), strict=True)
