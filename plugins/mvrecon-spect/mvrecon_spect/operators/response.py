@@ -9,12 +9,14 @@ images along the tangent of the angle to the axis.
 import csv
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -204,8 +206,12 @@ def _least_cosine(cameras: Cameras) -> float:
 
 def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
     """Coefficients of 1, t, .. that fit values best."""
-    powers = torch.stack([t**n for n in range(terms)], dim=1)
-    return torch.linalg.lstsq(powers, values[:, None]).solution[:, 0]
+    return _solved(torch.stack([t**n for n in range(terms)], dim=1), values)
+
+
+def _solved(rows: Float[Tensor, "n k"], values: Float[Tensor, " n"]) -> Float[Tensor, " k"]:
+    """Least squares."""
+    return torch.linalg.lstsq(rows, values[:, None]).solution[:, 0]
 
 
 def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
@@ -218,7 +224,8 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
             that of the hole in this law, which is compared, and
             `distance_mm` l from hole to detector, if that is not of all cameras. Variances are
             fitted in l / depth and 1 - cos, of as many terms as there are depths and
-            angles that differ by `APART` and `DEGREES_APART`, at most three and two.
+            angles that differ by `APART` and `DEGREES_APART`, at most three and two, and fewer
+            where the variances were not positive in the whole grid.
         hole: its sensitivity is the law's.
         cameras: a rig with one distance from hole to detector, unless the table has it.
         grid: the voxels.
@@ -270,26 +277,31 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
     m, cosine = lengths / depth, torch.deg2rad(angle).cos()
     t, tangent2 = 1 - cosine, 1 / cosine**2 - 1
     depths, angles = _apart(m, APART * m.max().item()), _apart(angle.abs(), DEGREES_APART)
-    used = [3 * j + i for j in range(min(angles, 2)) for i in range(min(depths, 3))]
-    terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)[:, used]
+    terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)
+    field = _field(cameras, grid)
+    _warn_of_depths(path, m, field.terms[:, 1])
 
-    def fitted(values: Tensor, rows: Tensor) -> tuple[float, ...]:
-        coefficients = torch.zeros(6, dtype=torch.float64)
-        coefficients[used] = torch.linalg.lstsq(rows, values[:, None]).solution[:, 0]
-        return tuple(coefficients.tolist())
+    def widths(orders: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Coefficients of variances by so many terms of the depth and of the angle."""
+        used = [3 * j + i for j in range(orders[1]) for i in range(orders[0])]
+        detector, smear = torch.zeros(2, 6, dtype=torch.float64)
+        detector[used] = _solved(terms[:, used], (tangential / FWHM) ** 2)
+        if angle.abs().max() >= DEGREES_APART:  # on the axis, radial is no direction
+            rows = terms[:, used] * tangent2[:, None]
+            smear[used] = _solved(rows, (radial**2 - tangential**2) / FWHM**2)
+        return detector, smear
 
-    detector = fitted((tangential / FWHM) ** 2, terms)
-    more = (radial**2 - tangential**2) / FWHM**2
-    oblique = angle.abs().max() >= DEGREES_APART  # on the axis, radial is no direction
-    smear = fitted(more, terms * tangent2[:, None]) if oblique else (0.0,) * 6
-    efficiency = (1.0, 0.0, 0.0)
+    orders = product(range(min(depths, 3), 0, -1), range(min(angles, 2), 0, -1))
+    fits = map(widths, sorted(orders, key=sum, reverse=True))
+    detector, smear = _first_positive(path, "widths", fits, lambda fit: field.variances(*fit))
+    efficiency = torch.tensor([1.0, 0.0, 0.0])
     if "efficiency" in columns:
         values = torch.tensor(columns["efficiency"], dtype=torch.float64)
-        fit = _polynomial(t, values, min(angles, 3)).tolist()
-        efficiency = (*fit, 0.0, 0.0)[:3]
-    response = Response(detector=detector, radial=smear, efficiency=efficiency)
-    _check_covered(path, response, cameras, grid, m)
-    return response
+        counts = range(min(angles, 3), 0, -1)
+        fits = (F.pad(_polynomial(t, values, count), (0, 3 - count)) for count in counts)
+        efficiency = _first_positive(path, "efficiencies", fits, field.efficiencies)
+    parts = (tuple(part.tolist()) for part in (detector, smear, efficiency))
+    return Response(**dict(zip(("detector", "radial", "efficiency"), parts, strict=True)))
 
 
 def _apart(values: Float[Tensor, " n"], least: float) -> int:
@@ -301,41 +313,68 @@ def _apart(values: Float[Tensor, " n"], least: float) -> int:
     return count
 
 
-@torch.no_grad()
-def _check_covered(
-    path: Path, response: Response, cameras: Cameras, grid: Grid, known: Float[Tensor, " n"]
-) -> None:
-    """Check a table's response at points of the grid in the field of each detector; see
-    `measured`.
+class _Field(NamedTuple):
+    """Points of a grid in the field of a detector: 1, m, m^2, t, t m, t m^2 of each, and its
+    squared tangents along u and v.
     """
+
+    terms: Float[Tensor, "p 6"]
+    tangents2: Float[Tensor, "p 2"]
+
+    def variances(self, detector: Tensor, radial: Tensor) -> Float[Tensor, "p 2"]:
+        """Variances along u and v in mm^2."""
+        terms = self.terms.to(detector)
+        return (terms @ detector)[:, None] + (terms @ radial)[:, None] * self.tangents2
+
+    def efficiencies(self, coefficients: Float[Tensor, "3"]) -> Float[Tensor, " p"]:
+        """By 1, t, t^2."""
+        t = self.terms[:, 3]
+        return torch.stack([t**0, t, t**2], dim=1) @ coefficients.to(t)
+
+
+def _field(cameras: Cameras, grid: Grid) -> _Field:
+    """Points of a grid, before all pinholes in whose detector's field they are."""
     axes = [torch.linspace(0, n - 1, PLACES, dtype=torch.float64) for n in grid.size]
     images = cameras.project(grid.to_world(torch.cartesian_prod(*axes)).to(cameras.source))
-    pixels, length = images[..., :2], cameras.distance[:, None]
+    pixels, length = images.detach()[..., :2], cameras.distance.detach()[:, None]
     end = pixels.new_tensor(cameras.shape[::-1]) - 0.5
     seen = (images[..., 2] < 0) & ((pixels > -0.5) & (pixels < end)).all(dim=-1)
-    steps = torch.stack([cameras.u, cameras.v], dim=1)
-    beam = pixels @ steps + (cameras.origin - cameras.source)[:, None]
+    steps = torch.stack([cameras.u, cameras.v], dim=1).detach()
+    beam = pixels @ steps + (cameras.origin - cameras.source).detach()[:, None]
     tangents = beam @ (steps / steps.norm(dim=-1, keepdim=True)).mT / length[..., None]
-    m, t = (length / -images[..., 2])[seen], (1 - length / beam.norm(dim=-1))[seen]
-    powers = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)
-    detector, radial = (powers @ m.new_tensor(c) for c in (response.detector, response.radial))
-    variance = detector[:, None] + radial[:, None] * tangents[seen] ** 2
-    efficiency = torch.stack([t**0, t, t**2], dim=1) @ m.new_tensor(response.efficiency)
-    good = (variance > 0).all(dim=1) & (efficiency > 0)
-    about = f"its magnifications, l / depth, are {known.min():.3g} to {known.max():.3g}"
-    if not good.all():
-        bad = m[~good]
-        raise ValueError(
-            f"{path}: expected positive widths and efficiencies of all voxels in the detectors' "
-            f"fields, got others at magnifications of {bad.min():.3g} to {bad.max():.3g}; {about}: "
-            f"add sources there, or make the grid smaller"
-        )
-    if m.numel() and (m.max() > MAX_BEYOND * known.max() or MAX_BEYOND * m.min() < known.min()):
+    m = (-length / images.detach()[..., 2])[seen]
+    t = (1 - length / beam.norm(dim=-1))[seen]
+    return _Field(torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1), tangents[seen] ** 2)
+
+
+def _warn_of_depths(path: Path, known: Float[Tensor, " n"], asked: Float[Tensor, " p"]) -> None:
+    """Warn about a grid far beyond the magnifications of a table."""
+    if not asked.numel():
+        return
+    (low, high), (least, most) = known.aminmax(), asked.aminmax()
+    if most > MAX_BEYOND * high or MAX_BEYOND * least < low:
         warnings.warn(
-            f"{path}: {about}, those of the grid {m.min():.3g} to {m.max():.3g}; widths there are "
-            f"extrapolated",
-            stacklevel=2,
+            f"{path}: expected sources at the depths of the grid, of magnifications l / depth of "
+            f"{least:.3g} to {most:.3g}, got {low:.3g} to {high:.3g}; widths are extrapolated",
+            stacklevel=4,
         )
+
+
+def _first_positive(
+    path: Path, what: str, fits: Iterable[Any], values_of: Callable[[Any], Tensor]
+) -> Any:
+    """The first of several fits with positive values in the whole field.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for fit in fits:
+        if (values_of(fit) > 0).all():
+            return fit
+    raise ValueError(
+        f"{path}: expected positive {what} of all voxels in the detectors' fields, got others by "
+        f"each fit of the table; add sources at their depths and angles, or make the grid smaller"
+    )
 
 
 def record_of(
