@@ -118,6 +118,20 @@ def test_each_frame_of_a_dynamic_study_has_the_duration_of_its_phase(tmp_path: P
     assert [one.views[0].duration_s for _, one in read_frames(path)] == [10.0] * 4 + [60.0] * 2
 
 
+def test_a_rotation_of_another_duration_than_its_phase_is_refused(tmp_path: Path):
+    """Of several views in each frame: the duration of a view may be either."""
+    phases = pydicom.dcmread(in_phases(tmp_path / "a.dcm", 10, 60)).PhaseInformationSequence
+    slices = [1, 1, 2, 2, 3, 3, 4, 4, 1, 1, 2, 2]
+    times = {"PhaseVector": [1] * 8 + [2] * 4, "TimeSliceVector": slices}
+    views = {"DetectorVector": [1] * 12, "AngularViewVector": [1, 2] * 6}
+    given = {"EnergyWindowVector": [1] * 12, "PhaseInformationSequence": phases, **times, **views}
+    with pytest.raises(Refused, match="of RotationInformationSequence in PhaseInf.*20000.*10000"):
+        open_projections(study(tmp_path / "b.dcm", **given), dataset="frame1")
+    phases[0].ActualFrameDuration = 20000
+    stack = open_projections(study(tmp_path / "c.dcm", **given), dataset="frame6")
+    assert stack.duration_s == 60.0 and stack.starts_s is None  # one view after the other?
+
+
 def test_the_duration_of_a_gate_is_not_that_of_its_views(tmp_path: Path):
     """Also of a single gate, such as one that was exported alone: neither 20 s of a view nor the
     0.125 s of a slot. Also tried: without FrameTime, several R-R intervals.

@@ -8,6 +8,7 @@ and increase towards the patient's left (counter-clockwise, viewed from the feet
 
 from collections.abc import Iterator, Sequence
 from datetime import datetime
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -215,7 +216,7 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
         dataset = {name: image.value(name) for name in named}
         _check_starts(path, dataset, known)
         _check_rotations(path, dataset, known)
-        _check_durations(path, dataset)
+        _check_durations(path, dataset, known)
         views = tuple(_view(dataset, key, known) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
         frames = [_frame(dataset, moment, moments) for moment in moments]
@@ -404,15 +405,24 @@ def _alike(name: str, one: Any, other: Any) -> bool:
     return 1 in (len(a), len(b)) and bool((abs(a - b) < 0.1).any())
 
 
-def _check_durations(path: Path, dataset: Any) -> None:
-    """Raise if the image's frame duration is none of its rotations' or phases'."""
-    name, whole = "ActualFrameDuration", dataset.get("ActualFrameDuration")
-    for sequence in ("RotationInformationSequence", "PhaseInformationSequence"):
-        found = [item.get(name) for item in dataset.get(sequence) or []]
-        found = [float(value) for value in found if value not in (None, "")]
-        if whole and found and not any(same(float(whole), value) for value in found):
+def _check_durations(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
+    """Raise if the image's frame duration is none of its rotations' or phases', or that of a
+    rotation of several views none of its phases'.
+    """
+    name, rotation = "ActualFrameDuration", "RotationInformationSequence"
+    groups = {"the image": [dataset]}
+    groups |= {key: dataset.get(key) or [] for key in (rotation, "PhaseInformationSequence")}
+    stated = {
+        place: [float(item.get(name)) for item in items if item.get(name) not in (None, "", 0)]
+        for place, items in groups.items()
+    }
+    turns = len({view[2] for view in views}) > 1
+    for (place, own), (other, found) in combinations(stated.items(), 2):
+        if place == rotation and not turns:
+            continue  # of a file that was made from a tomogram's
+        if own and found and not any(same(a, b) for a in own for b in found):
             raise Refused(
-                f"{path}: expected the {name} of the image in {sequence}, got {whole} and "
+                f"{path}: expected the {name} of {place} in {other}, got {shown(own)} and "
                 f"{shown(found)} ms; keep the one that is meant"
             )
 

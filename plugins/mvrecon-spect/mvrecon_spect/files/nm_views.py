@@ -76,9 +76,8 @@ class NmViews(ProjectionStack):
         if len(limits := study.windows[window].limits_kev) == 1:
             self.window_kev = limits[0]
         self.duration_s = _duration(path, study.views)
-        start = frames[moment].start_s if len(frames) > 1 else frames[moment].start_s or 0.0
-        if self.duration_s is not None and start is not None:
-            self.starts_s = _starts(study.views, start, self.duration_s)
+        if self.duration_s is not None:
+            self.starts_s = _starts(study.views, frames, moment, self.duration_s)
         self._angles = [view.angle_degrees for view in study.views]
         views = [f"detector {d} rotation {r} view {n}" for d, r, n, *_ in study.views]
         super().__init__(path, views, study.counts[0].shape[-2:], np.dtype("f4"))
@@ -148,7 +147,15 @@ def _duration(path: Path, views: Sequence[View]) -> float | None:
     return known[0]
 
 
-def _starts(views: Sequence[View], first_s: float, duration_s: float) -> list[float]:
-    """The start of each view in s since that of the measurement."""
+def _starts(
+    views: Sequence[View], frames: Sequence[Frame], moment: int, duration_s: float
+) -> list[float] | None:
+    """The start of each view in s since that of the measurement; None if unknown: of frames without
+    phases, or of several angular views, which may follow one another in each frame.
+    """
     turns = sorted({(view.rotation, view.number) for view in views})
-    return [first_s + duration_s * turns.index((view.rotation, view.number)) for view in views]
+    first = frames[moment].start_s
+    if len(frames) > 1 and (first is None or len(turns) > 1):
+        return None
+    numbers = (turns.index((view.rotation, view.number)) for view in views)
+    return [(first or 0.0) + duration_s * number for number in numbers]
