@@ -38,7 +38,7 @@ def joined(scans: Sequence[Scan]) -> Scan:
         views = scan.measured
         if not isinstance(views, MeasuredViews):
             raise ValueError("Expected scans of views on disk, got views in memory")
-        if scan.unit != CONCENTRATION and views.stack.dose is None:
+        if scan.unit != CONCENTRATION and (views.stack.dose is None or views.stack.own_unit):
             raise Refused(
                 f"{views.options.path}: expected factors.branching, the photons per decay, "
                 f"or views of a known dose, for joint measurements, got neither"

@@ -371,17 +371,18 @@ def _check_window(
     widths_kev: tuple[float | None, float | None],
 ) -> None:
     """Check that counts are those of another energy window than the views'; see `_read`."""
-    if torch.equal(counts[0, 0], views.whole().views):
+    own, window = views.stack.window_kev, other.stack.window_kev
+    if (own and own == window) or (counts.any() and torch.equal(counts[0, 0], views.whole().views)):
         raise Refused(
             f"{other.options.path}: expected the counts of another energy window for scatter, got "
             f"those of the views; DICOM NM names its windows, as in tomo.dcm:/window1"
         )
     for one, width in ((other, widths_kev[0]), (views, widths_kev[1])):
-        stated = one.stack.width_kev
-        if stated and width and abs(width / stated - 1) > MAX_WIDTH_DIFFERENCE:
+        low, high = one.stack.window_kev or (0.0, 0.0)
+        if high > low and width and abs(width / (high - low) - 1) > MAX_WIDTH_DIFFERENCE:
             raise Refused(
-                f"{one.options.path}: expected widths_kev with the {stated:g} keV of its energy "
-                f"window, got {width:g}"
+                f"{one.options.path}: expected widths_kev with the {high - low:g} keV of its "
+                f"energy window, got {width:g}"
             )
     if (counts != counts.round()).any():
         warnings.warn(

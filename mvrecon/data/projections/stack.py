@@ -85,14 +85,16 @@ class ProjectionStack(ABC):
     unit: str | None = None
     #: Expected counts per this unit, by which counts are divided; None: none is known.
     dose: float | None = None
+    #: Whether the unit is that of one count, which is another activity in another measurement.
+    own_unit: bool = False
     #: Duration of the measurement in s, if stored.
     duration_s: float | None = None
     #: Duration of all views together in s, if stored instead.
     total_s: float | None = None
     #: When the measurement began, if stored.
     began: datetime | None = None
-    #: Width of the energy window in keV, if stored.
-    width_kev: float | None = None
+    #: Limits of the energy window in keV, if stored.
+    window_kev: tuple[float, float] | None = None
     #: Start of each view in s since that of the measurement, if stored.
     starts_s: Sequence[float] | None = None
     #: Whether they are attenuated counts, as `mvrecon-simulate` states in the file.

@@ -81,3 +81,33 @@ def test_matter_around_the_grid_attenuates_and_matter_beside_it_is_refused(tmp_p
     save_volume(path, disc(0, RADIUS), elsewhere)
     with pytest.raises(ValueError, match="got all of it elsewhere"):
         Spect(grid, cameras, mu=path)
+
+
+@pytest.mark.parametrize(
+    ("slices", "told"), [((0, 76), False), ((30, 76), True), ((0, 50), True), ((8, 68), False)]
+)
+def test_a_map_that_ends_within_body_and_grid_is_told(tmp_path, recwarn, slices, told):
+    """A CT of fewer slices than the activity has. Also tried: an end within the grid in air, along
+    x, and less than a voxel before the grid's end; a map turned by 30 degrees.
+    """
+    first, last = slices
+    affine = MAP.affine.clone()
+    affine[:3, 3] = MAP.to_world(torch.tensor([0.0, 0, first]).double())
+    short = Grid((last - first, *MAP.shape[1:]), affine)
+    body = disc(0, RADIUS)
+    body[:8] = body[68:] = 0  # air at both ends of the map
+    body[first if told else 8] = body[last - 1 if told else 67] = WATER
+    save_volume(tmp_path / "mu.nii.gz", body[first:last], short)
+    grid = Grid.centred(size=(20, 20, 59), spacing=4.0)
+    Spect(grid, dcspect80(pixels=8, columns=[0]), mu=tmp_path / "mu.nii.gz")
+    found = [w for w in recwarn if "expected a map of the whole body" in str(w.message)]
+    assert bool(found) is told
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_a_map_of_any_precision_attenuates_alike(dtype):
+    """Tables of integrals are of single or double precision, whatever the map's."""
+    grid, rig = Grid.centred(10, spacing=12.0), dcspect80(pixels=8, columns=[0])
+    mu, x = torch.full(grid.shape, 0.015625), torch.rand(1, 1, *grid.shape)
+    expected = Spect(grid, rig, mu=mu)(x)
+    torch.testing.assert_close(Spect(grid, rig, mu=mu.to(dtype))(x), expected)

@@ -39,6 +39,7 @@ PROJECTORS = {
     "pinhole in the object": (replace(RIG, source=RIG.source * 0.1), {}, "pinhole 0 in it"),
     "camera in cm": (IN_CM, {}, "mm and cm of camera and grid"),
     "detector before its pinhole": (AVERTED, {}, "detector's side of pinhole 0"),
+    "skewed pixels": (replace(RIG, v=RIG.v + 0.3 * RIG.u), {}, "rectangular pixels, .* 73.3 deg"),
     "hole of 0 mm": (RIG, {"diameter_mm": 0.0}, "positive mm, got 0"),
     "hole as text": (RIG, {"diameter_mm": "2.3"}, "positive mm, got 2.3"),
     "hole without a size": (RIG, {"diameter_mm": None}, "positive mm, got None"),

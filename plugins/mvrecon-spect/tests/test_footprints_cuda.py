@@ -111,7 +111,8 @@ def case(name: str, hole: str = "blurred", dtype: torch.dtype = D, attenuated: b
     """Two volumes, views, and what both operators share: rig, and transmission or None."""
     torch.manual_seed(1)
     (rig, grid), (opening, options) = FIELDS[name], HOLES[hole]
-    response = response_of(**({"option": "geometric", "hole": opening, "cameras": rig} | options))
+    given = {"option": "geometric", "hole": opening, "cameras": rig, "grid": grid}
+    response = response_of(**(given | options))
     x = torch.rand(2, *grid.shape, dtype=dtype) - 0.2
     y = torch.rand(2, len(rig), *rig.shape, dtype=dtype) - 0.2
     passed = torch.rand(len(rig), *grid.shape, dtype=dtype) if attenuated else None

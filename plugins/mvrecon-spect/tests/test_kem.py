@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.classical.mlem import osem
 from mvrecon.testing import check_method
 from mvrecon_spect.methods.kem import kem, kernel_matrix
@@ -117,3 +118,20 @@ def test_the_anatomy_defaults_to_attenuation_and_a_wrong_shape_is_refused():
     B = Spect(grid, rig, mu=mu)
     y = B(torch.ones(1, 1, *grid.shape))
     assert torch.equal(kem(B, y, 2), kem(B, y, 2, anatomy=mu))
+
+
+@pytest.mark.parametrize("air", [-1000.0, 0.0])
+def test_beyond_a_short_ct_the_anatomy_is_air(tmp_path, air):
+    """Not 0 HU, water, which smears the body: the volume is that by a CT of the whole grid. Also
+    tried: a CT about a corner of the grid, turned against it.
+    """
+    grid, rig = Grid.centred(12, spacing=10.0), dcspect80(pixels=16, columns=[2, 7, 12, 17])
+    A, place = Spect(grid, rig, 4.0), torch.tensor([10.0, 0.0, -5.0])
+    y = A(2e3 * ((voxel_centres(grid) - place).norm(dim=-1) < 28).float()[None, None])
+    volumes = []
+    for size in (30, 40):  # 90 mm, and all 120 mm
+        ct = Grid.centred(size, spacing=3.0)
+        body = (voxel_centres(ct) - place).norm(dim=-1) < 28
+        save_volume(tmp_path / "ct.nii.gz", torch.where(body, 40.0, air), ct)
+        volumes.append(kem(A, y, 10, anatomy=tmp_path / "ct.nii.gz"))
+    torch.testing.assert_close(*volumes, rtol=1e-3, atol=1.0)

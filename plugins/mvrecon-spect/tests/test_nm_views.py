@@ -5,6 +5,7 @@ import warnings
 from copy import deepcopy
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,8 +17,8 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon_spect.files.nm import read_nm
-from tests.data.nm_files import in_time, study
+from mvrecon_spect.files.nm import read_frames, read_nm
+from tests.data.nm_files import in_time, item, study
 
 pydicom = pytest.importorskip("pydicom")
 pytestmark = pytest.mark.usefixtures("parts")
@@ -88,6 +89,94 @@ def test_starts_are_those_of_the_file(tmp_path: Path):
     assert settings.unit == "kBq/ml"
 
 
+def in_phases(path: Path, *seconds: int, **changes: object) -> Path:
+    """Four frames of a phase and two of a second one, of these durations."""
+    phases = [
+        item(
+            pydicom.Dataset,
+            PhaseDelay=0,
+            ActualFrameDuration=1000 * duration,
+            PauseBetweenFrames=0,
+            NumberOfFramesInPhase=count,
+        )
+        for duration, count in zip(seconds, (4, 2), strict=True)
+    ]
+    vectors = ("PhaseVector", "TimeSliceVector")
+    return in_time(path, vectors, PhaseInformationSequence=phases, **changes)
+
+
+@pytest.mark.parametrize("image", [None, 10000, 60000])
+def test_each_frame_of_a_dynamic_study_has_the_duration_of_its_phase(tmp_path: Path, image):
+    """Whatever the image or, without it, a rotation states. Also tried: three phases, the counts of
+    a window in frames of unequal durations as scatter.
+    """
+    given = {"ActualFrameDuration": image, "RotationInformationSequence": []} if image else {}
+    path = in_phases(tmp_path / "a.dcm", 10, 60, **given)
+    for name, duration, start in (("frame2", 10.0, 10.0), ("frame6", 60.0, 100.0)):
+        stack = open_projections(path, dataset=name)
+        assert stack.duration_s == duration and stack.starts_s == [start] * 2
+    assert [one.views[0].duration_s for _, one in read_frames(path)] == [10.0] * 4 + [60.0] * 2
+
+
+def test_a_rotation_of_another_duration_than_its_phase_is_refused(tmp_path: Path):
+    """Of several views in each frame: the duration of a view may be either."""
+    phases = pydicom.dcmread(in_phases(tmp_path / "a.dcm", 10, 60)).PhaseInformationSequence
+    slices = [1, 1, 2, 2, 3, 3, 4, 4, 1, 1, 2, 2]
+    times = {"PhaseVector": [1] * 8 + [2] * 4, "TimeSliceVector": slices}
+    views = {"DetectorVector": [1] * 12, "AngularViewVector": [1, 2] * 6}
+    given = {"EnergyWindowVector": [1] * 12, "PhaseInformationSequence": phases, **times, **views}
+    with pytest.raises(Refused, match="of RotationInformationSequence in PhaseInf.*20000.*10000"):
+        open_projections(study(tmp_path / "b.dcm", **given), dataset="frame1")
+    phases[0].ActualFrameDuration = 20000
+    stack = open_projections(study(tmp_path / "c.dcm", **given), dataset="frame6")
+    assert stack.duration_s == 60.0 and stack.starts_s is None  # one view after the other?
+
+
+def test_the_duration_of_a_gate_is_not_that_of_its_views(tmp_path: Path):
+    """Also of a single gate, such as one that was exported alone: neither 20 s of a view nor the
+    0.125 s of a slot. Also tried: without FrameTime, several R-R intervals.
+    """
+    slot = item(pydicom.Dataset, FrameTime=125.0)
+    gate = [item(pydicom.Dataset, DataInformationSequence=[slot])]
+    for turn in ({}, {"RotationInformationSequence": []}):
+        path = study(tmp_path / "a.dcm", GatedInformationSequence=gate, **turn)
+        stack = open_projections(path, dataset="window1")
+        assert stack.duration_s is stack.starts_s is None
+
+
+def test_an_unknown_start_of_a_frame_is_asked_for(tmp_path: Path):
+    """Frames in time without phases have a duration by their rotation, and no start; a duration
+    of 0 is unknown.
+    """
+    path = in_time(tmp_path / "a.dcm", ("PhaseVector", "TimeSliceVector"))
+    stack = open_projections(path, dataset="frame3")
+    assert stack.duration_s == 20.0 and stack.starts_s is None
+    turn = item(pydicom.Dataset, ActualFrameDuration=0)
+    path = study(tmp_path / "b.dcm", RotationInformationSequence=[turn])
+    assert open_projections(path, dataset="window1").duration_s is None
+    turn.ActualFrameDuration = -1
+    with pytest.raises(Refused, match="ActualFrameDuration is not negative"):
+        open_projections(study(tmp_path / "c.dcm", RotationInformationSequence=[turn]))
+    with pytest.raises(Refused, match="a positive ActualFrameDuration"):
+        open_projections(in_phases(tmp_path / "d.dcm", 10, 0), dataset="frame1")
+
+
+def test_counts_without_their_photons_are_not_joined(tmp_path: Path):
+    """Two windows, and two frames of unequal durations, of a file without a dose. Also tried:
+    factors without branching in the second one alone, Interfile.
+    """
+    path = study(tmp_path / "a.dcm")
+    frames = in_phases(tmp_path / "b.dcm", 10, 60)
+    for file, angles, name, other, factors in (
+        (path, ANGLES, "window2", "window1", "null"),
+        (frames, (10.0, 190.0), "frame1", "frame6", "null"),
+        (path, ANGLES, "window2", "window1", "{name: detector, time_s: 20}"),
+    ):
+        chosen = f"views.dataset={name}", f"joint=[{{views: {{dataset: {other}}}}}]"
+        with pytest.raises(Refused, match="expected factors.branching"):
+            scan(file, rig(*angles), *chosen, f"factors={factors}")
+
+
 def test_views_of_different_durations_are_refused(tmp_path: Path):
     """Twice the counts in twice the time would be twice the activity."""
     file = pydicom.dcmread(study(tmp_path / "a.dcm"))
@@ -107,6 +196,27 @@ def test_scatter_is_estimated_from_another_window_of_the_file(tmp_path: Path):
     dew = f"scatter={{name: dew, lower: '{path}:/window1', k: 0.25}}"
     found = scan(path, rig(*ANGLES), "views.dataset=window2", dew).scatter
     assert torch.equal(found, 0.25 * read_nm(path).counts[0])
+
+
+def test_the_energy_window_of_the_views_is_no_scatter_window(tmp_path: Path):
+    """Of another file, whose window is by default that of the views, or of Interfile; a window
+    without any counts is one. Also tried: tew with such an upper window.
+    """
+    path, other = study(tmp_path / "a.dcm"), tmp_path / "b.dcm"
+    file = pydicom.dcmread(path)
+    file.PixelData = (2 * np.frombuffer(file.PixelData, "<u2")).tobytes()
+    file.save_as(other)
+    chosen, dew = "views.dataset=window2", "scatter={{name: dew, lower: '{}'}}"
+    with pytest.raises(Refused, match="b.dcm: expected the counts of another energy window"):
+        scan(path, rig(*ANGLES), chosen, dew.format(other))
+    assert scan(path, rig(*ANGLES), chosen, dew.format(f"{other}:/window1")).scatter.any()
+    file.PixelData = bytes(len(file.PixelData))
+    file.save_as(other)
+    empty = scan(other, rig(*ANGLES), chosen, dew.format(f"{other}:/window1"))
+    assert not empty.scatter.any()
+    peak, same = (interfile(tmp_path / f"{n}.hs", n, kev=(126, 154)) for n in (9.0, 4.0))
+    with pytest.raises(Refused, match="4.0.hs: expected the counts of another energy window"):
+        scan(peak, rig(*ANGLES), dew.format(same))
 
 
 def test_the_angles_of_the_rig_are_those_of_the_file_but_for_a_turn(tmp_path: Path):
@@ -182,8 +292,8 @@ def test_scatter_of_a_flat_spectrum_is_that_of_the_main_window(tmp_path: Path, s
         assert torch.allclose(found, torch.tensor(share * PER_KEV * PEAK_KEV))
 
 
-def interfile(path: Path, counts: float, *lines: str) -> Path:
-    """Six views of 4 x 5 pixels of one number of counts in a window of 126 to 154 keV."""
+def interfile(path: Path, counts: float, *lines: str, kev: tuple = (98, 126)) -> Path:
+    """Six views of 4 x 5 pixels of one number of counts in an energy window."""
     path.with_suffix(".s").write_bytes(torch.full((6, 4, 5), counts).numpy().tobytes())
     keys = [
         *("INTERFILE", "imaging modality := nucmed"),
@@ -193,7 +303,8 @@ def interfile(path: Path, counts: float, *lines: str) -> Path:
         *("matrix axis label [1] := bin coordinate", "matrix size [1] := 5"),
         *("matrix axis label [2] := axial coordinate", "matrix size [2] := 4"),
         *("scaling factor (mm/pixel) [1] := 1.5", "scaling factor (mm/pixel) [2] := 2"),
-        *("energy window lower level[1] := 126", "energy window upper level[1] := 154", *lines),
+        *(f"energy window lower level[1] := {kev[0]}", f"energy window upper level[1] := {kev[1]}"),
+        *lines,
         "END OF INTERFILE",
     ]
     path.write_text("".join(f"!{key}{'' if ':=' in key else ' :='}\n" for key in keys))
@@ -204,7 +315,7 @@ def test_counts_of_interfile_are_scaled_by_the_durations_of_both_files(tmp_path:
     """The duration is that of all views. Without it, or by NM of one view alone, counts are used as
     they are, with a warning; -1, as STIR writes it, is none.
     """
-    path = interfile(tmp_path / "a.hs", 9.0, "image duration (sec)[1] := 600")
+    path = interfile(tmp_path / "a.hs", 9.0, "image duration (sec)[1] := 600", kev=(126, 154))
     for seconds, share in ((300, 2.0), (600, 1.0)):
         other = interfile(tmp_path / "b.hs", 4.0, f"image duration (sec)[1] := {seconds}")
         found = scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}").scatter
@@ -244,7 +355,7 @@ def test_windows_that_contradict_an_estimate_of_scatter(tmp_path: Path):
         with pytest.raises(ValueError, match=message):
             scan(path, rig(*ANGLES), chosen, f"scatter={{{text}}}")
     other = interfile(tmp_path / "b.hs", 4.5)
-    main = interfile(tmp_path / "c.hs", 9.0)
+    main = interfile(tmp_path / "c.hs", 9.0, kev=(126, 154))
     with pytest.warns(UserWarning, match="expected whole numbers as the counts"):
         scan(main, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}")
     with pytest.raises(Refused, match="28 keV .*got 10"):

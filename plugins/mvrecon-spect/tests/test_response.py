@@ -10,7 +10,9 @@ from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.projector import Spect
+from mvrecon_spect.operators.response import measured
 
 LENGTH, FWHM = 70.0, 2 * math.sqrt(2 * math.log(2))
 CRYSTAL = {"angles": True, "crystal_mm": 5.0, "attenuation_per_mm": 0.25}
@@ -101,6 +103,91 @@ def test_a_measured_response_has_the_widths_of_its_table(tmp_path):
         assert (seen[2], seen[4]) == pytest.approx((u, v), rel=5e-3)
         share = 1 - 0.2 * math.tan(math.radians(degrees)) ** 2
         assert seen[0] / thin[0] == pytest.approx(share, rel=1e-3)
+
+
+def table(path: Path, *rows: tuple[float, ...], more: str = "") -> Path:
+    """A table of depths, angles, and radial and tangential FWHM, and further columns."""
+    head = f"depth_mm,angle_degrees,fwhm_radial_mm,fwhm_tangential_mm{more}"
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]))
+    return path
+
+
+@pytest.mark.parametrize("apart", [1e-5, 0.01, 0.5])
+def test_depths_that_hardly_differ_make_no_slope(tmp_path, apart):
+    """Of one source before many pinholes, whose depths and angles differ by rounding or by a
+    little: widths, with noise, are those of one depth, at another depth as well.
+    """
+    noise = torch.randn(2, 20, generator=torch.Generator().manual_seed(0)) * 0.03
+    rows = [
+        (150 + apart * k / 20, apart * (k % 5), 3 + u, 3 + v)
+        for k, (u, v) in enumerate(noise.T.tolist())
+    ]
+    path = table(tmp_path / "psf.csv", *rows)
+    for depth in (120.0, 150.0, 185.0):
+        _, _, u, _, v = image(0.0, depth, response=path)
+        assert (FWHM * u**0.5, FWHM * v**0.5) == pytest.approx((3, 3), rel=0.02)
+
+
+def test_a_table_of_one_angle_has_both_of_its_widths(tmp_path):
+    """The radial one was taken to be the tangential one, unless there was another angle."""
+    path = table(tmp_path / "psf.csv", (150, 25, 4.0, 3.0), (200, 25, 3.5, 2.5))
+    for depth, radial, tangential in ((150.0, 4.0, 3.0), (200.0, 3.5, 2.5)):
+        _, _, u, _, v = image(25.0, depth, response=path)
+        assert (FWHM * u**0.5, FWHM * v**0.5) == pytest.approx((radial, tangential), rel=5e-3)
+
+
+WIDE = Grid.centred(size=(60, 60, 2), spacing=5.0, centre=(0, 0, 120))
+
+
+@pytest.mark.parametrize(
+    ("rows", "more"),
+    [
+        ([(220, 0, 3, 3), (180, 0, 2, 2)], ""),  # a line through these is negative at 120 mm
+        ([(300, 0, 3, 3, 1), (300, 10, 3, 3, 0.9), (300, 30, 3, 3, 0.1)], ",efficiency"),
+    ],
+)
+def test_polynomials_have_fewer_terms_where_they_were_not_positive(tmp_path, rows, more):
+    """In the whole field of the detector, whatever the noise of a table. Also tried: tables of
+    noisy images of one source, of several and of a line, with and without a crystal.
+    """
+    response = measured(table(tmp_path / "psf.csv", *rows, more=more), Hole(), pinhole(41), WIDE)
+    A = Spect(WIDE, pinhole(41), blur=True, response=tmp_path / "psf.csv")
+    sharp = Spect(WIDE, pinhole(41))
+    x = torch.zeros(1, 1, *WIDE.shape)
+    x[..., 30, 45], x[..., 45, 45] = 1, 1  # on the edge of the field, and at its corner
+    seen, thin = A(x)[0, 0, 0], sharp(x)[0, 0, 0]
+    assert seen.isfinite().all() and seen.min() >= 0 and seen.sum() > 0.05 * thin.sum()
+    assert response.detector[0] > 0 and seen.max() < 0.9 * thin.max()
+
+
+@pytest.mark.parametrize("efficiency", [-1.0, 0.0, math.nan, math.inf])
+def test_tables_without_a_positive_fit_are_refused(tmp_path, efficiency):
+    path = table(tmp_path / "psf.csv", (120, 0, 3, 3, efficiency), more=",efficiency")
+    with pytest.raises(ValueError, match="expected (positive efficiencies|finite, positive mm)"):
+        Spect(WIDE, pinhole(41), blur=True, response=path)
+    narrow = table(tmp_path / "narrow.csv", (120, 0, 3, 3), (120, 20, 2, 3))  # none at 50 degrees
+    with pytest.raises(ValueError, match="expected positive widths"):
+        Spect(WIDE, pinhole(41), blur=True, response=narrow)
+
+
+def test_a_grid_far_beyond_the_depths_of_a_table_is_told(tmp_path, recwarn):
+    path = table(tmp_path / "psf.csv", (140, 0, 3, 3), (180, 0, 2.8, 2.8))
+    for depth, told in ((130, False), (150, False), (200, False), (90, True), (260, True)):
+        recwarn.clear()
+        Spect(Grid.centred(2, spacing=1.0, centre=(0, 0, depth)), pinhole(9), 2.3, None, True,
+              response=path)  # fmt: skip
+        assert any("are extrapolated" in str(w.message) for w in recwarn) is told
+
+
+def test_efficiencies_are_those_of_the_hole_of_their_law(tmp_path):
+    """The area of another hole, or of one with penetration, is refused. Also tried: rectangles."""
+    area = math.pi * 3.0**2 / 4
+    path = table(tmp_path / "psf.csv", (150, 0, 3, 3, 0.8, area), more=",efficiency,area_mm2")
+    seen, thin = image(0.0, 150.0, 3.0, response=path), image(0.0, 150.0, 3.0)
+    assert seen[0] / thin[0] == pytest.approx(0.8, rel=1e-6)
+    for diameter, edge in ((2.3, {}), (3.0, {"collimator_mu": 3.0}), ((3.0, 3.0), {})):
+        with pytest.raises(ValueError, match="expected the hole of its efficiencies"):
+            image(0.0, 150.0, diameter, response=path, **edge)
 
 
 @pytest.mark.parametrize(

@@ -372,6 +372,13 @@ def test_the_operator_of_the_command_uses_sigma_and_acceptance_of_the_files(
     )
     with pytest.raises(ValueError, match="expected the cameras of this file"):
         stir_projector(grid, dcspect80(pixels=24), tmp_path / "scan" / "input.hs")
+    # a measured response, which contains the detector's, in place of sigma
+    head = "depth_mm,angle_degrees,fwhm_radial_mm,fwhm_tangential_mm"
+    (tmp_path / "psf.csv").write_text(f"{head}\n28,0,2.5,2.5\n")
+    known = compose(*options, f"projector.response={tmp_path}/psf.csv", config_name="reconstruct")
+    measured = Spect(grid, rig, 1.0, blur=True, response=tmp_path / "psf.csv")(x)
+    B = read_scan(ReconstructSettings(**known)).operator()
+    torch.testing.assert_close(B(x), measured * mask)
 
 
 def test_the_app_reconstructs_a_stir_measurement(tmp_path: Path):

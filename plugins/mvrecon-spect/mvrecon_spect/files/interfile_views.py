@@ -26,14 +26,15 @@ class InterfileViews(ProjectionStack):
     kind = "counts"
     unit = "spect of activity"
     dose = 1.0
+    own_unit = True
 
     def __init__(self, path: Path):
         header = read_header(path, "projections")
         views, rows, columns = views_shape(header)
         self._numbers = numbers_of(header, (views, rows, columns))
         names = [f"{path.stem} {k}" for k in range(views)]
-        ends = [header.number(f"energy window {end} level", 0.0) for end in ("lower", "upper")]
-        self.width_kev = ends[1] - ends[0] if ends[1] > ends[0] > 0 else None
+        low, high = (header.number(f"energy window {end} level", 0.0) for end in ("lower", "upper"))
+        self.window_kev = (low, high) if high > low > 0 else None
         seconds = header.number("image duration (sec)", 0.0)
         self.total_s = seconds if seconds > 0 else None  # 0 and -1: unknown
         super().__init__(path, names, (rows, columns), np.dtype("f4"))

@@ -8,6 +8,7 @@ and increase towards the patient's left (counter-clockwise, viewed from the feet
 
 from collections.abc import Iterator, Sequence
 from datetime import datetime
+from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -76,7 +77,8 @@ KEYS = (
     Key(
         "ActualFrameDuration",
         "applied",
-        "of the rotation or phase, else of the image; these must have one in common",
+        "of the phase, else of the rotation, else of the image; these must have one in common; "
+        "unknown of gated frames",
     ),
     Key("FrameTime", "applied", "of the one item of GatedInformationSequence"),
     *(Key(name, "applied") for name in ("PhaseDelay", "PauseBetweenFrames")),
@@ -109,7 +111,8 @@ CORRECTED = {"ATTN", "SCAT", "DECY", "RAN", "DCAL"}
 class View(NamedTuple):
     """Identity of a view: detector, rotation and number in the rotation, from 1; angle in degrees,
     distance of the detector from the axis in mm and duration in s, each None if the file
-    does not contain it.
+    does not contain it. The duration of a dynamic frame is that of its phase; that of a gated one,
+    a part of each cycle, is unknown.
     """
 
     detector: int
@@ -213,18 +216,22 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
         dataset = {name: image.value(name) for name in named}
         _check_starts(path, dataset, known)
         _check_rotations(path, dataset, known)
-        _check_durations(path, dataset)
+        _check_durations(path, dataset, known)
         views = tuple(_view(dataset, key, known) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
         frames = [_frame(dataset, moment, moments) for moment in moments]
         start = began(image.dataset)
+    phases = bool(dataset["PhaseInformationSequence"])
+    gated = dataset["GatedInformationSequence"] or len({moment[2:] for moment in moments}) > 1
 
-    def study(moment: Moment) -> NmStudy:
-        chosen = ([order[moment, index, key] for key in known] for index in windows)
+    def study(frame: Frame) -> NmStudy:
+        chosen = ([order[frame[:4], index, key] for key in known] for index in windows)
         counts = tuple(pixels[images][None, None] for images in chosen)
-        return NmStudy(energies, counts, views, pixel_mm, start)
+        own = {"duration_s": None if gated else frame.duration_s}
+        timed = tuple(view._replace(**own) for view in views) if gated or phases else views
+        return NmStudy(energies, counts, timed, pixel_mm, start)
 
-    return ((frame, study(moment)) for frame, moment in zip(frames, moments, strict=True))
+    return ((frame, study(frame)) for frame in frames)
 
 
 def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
@@ -398,15 +405,24 @@ def _alike(name: str, one: Any, other: Any) -> bool:
     return 1 in (len(a), len(b)) and bool((abs(a - b) < 0.1).any())
 
 
-def _check_durations(path: Path, dataset: Any) -> None:
-    """Raise if the image's frame duration is none of its rotations' or phases'."""
-    name, whole = "ActualFrameDuration", dataset.get("ActualFrameDuration")
-    for sequence in ("RotationInformationSequence", "PhaseInformationSequence"):
-        found = [item.get(name) for item in dataset.get(sequence) or []]
-        found = [float(value) for value in found if value not in (None, "")]
-        if whole and found and not any(same(float(whole), value) for value in found):
+def _check_durations(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
+    """Raise if the image's frame duration is none of its rotations' or phases', or that of a
+    rotation of several views none of its phases'.
+    """
+    name, rotation = "ActualFrameDuration", "RotationInformationSequence"
+    groups = {"the image": [dataset]}
+    groups |= {key: dataset.get(key) or [] for key in (rotation, "PhaseInformationSequence")}
+    stated = {
+        place: [float(item.get(name)) for item in items if item.get(name) not in (None, "", 0)]
+        for place, items in groups.items()
+    }
+    turns = len({view[2] for view in views}) > 1
+    for (place, own), (other, found) in combinations(stated.items(), 2):
+        if place == rotation and not turns:
+            continue  # of a file that was made from a tomogram's
+        if own and found and not any(same(a, b) for a in own for b in found):
             raise Refused(
-                f"{path}: expected the {name} of the image in {sequence}, got {whole} and "
+                f"{path}: expected the {name} of {place} in {other}, got {shown(own)} and "
                 f"{shown(found)} ms; keep the one that is meant"
             )
 
@@ -432,13 +448,12 @@ def _view(dataset: Any, key: tuple[int, int, int], views: Sequence[tuple[int, in
         if (direction := turn.get("RotationDirection")) not in ("CW", "CC"):
             raise ValueError(f"RotationDirection is CW or CC, got {shown(direction)}")
         angle = (angle + {"CW": -1, "CC": 1}[direction] * step * (number - 1)) % 360
-    duration = _number("ActualFrameDuration", turn, 0, 1)
-    duration = _number("ActualFrameDuration", dataset, 0, 1) if duration is None else duration
+    duration = _seconds(turn) or _seconds(dataset)
     radii = [item.get("RadialPosition") for item in (first, second)]
     if np.size(radii[0]) == 1 < np.size(radii[1]) and _alike("RadialPosition", *radii):
         first, second = second, first  # one radius of the orbit that the other lists
     radius = stated("RadialPosition", number - 1, count)
-    return View(*key, angle, radius, None if duration is None else duration / 1000)
+    return View(*key, angle, radius, duration)
 
 
 def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
@@ -450,18 +465,27 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
         start = 0.0
         for number in range(1, phase + 1):
             item = _item(dataset, "PhaseInformationSequence", number)
-            duration, pause = float(item.ActualFrameDuration), float(item.PauseBetweenFrames or 0)
+            duration, pause = _seconds(item), float(item.PauseBetweenFrames or 0) / 1000
+            if duration is None:
+                raise ValueError("a phase needs a positive ActualFrameDuration")
             pieces, stated = {p for n, p, *_ in moments if n == number}, item.NumberOfFramesInPhase
             if len(pieces) > int(stated):
                 raise ValueError(f"NumberOfFramesInPhase is {stated}, got {len(pieces)} slices")
             before = piece - min(pieces) if number == phase else int(stated)
-            start += float(item.PhaseDelay or 0) + before * (duration + pause)
-        return Frame(*moment, start / 1000, duration / 1000)  # pyrefly: ignore[unbound-name]
+            start += float(item.PhaseDelay or 0) / 1000 + before * (duration + pause)
+        return Frame(*moment, start, duration)  # pyrefly: ignore[unbound-name]
     gate = _item(dataset, "GatedInformationSequence", 1)
     step = _number("FrameTime", _item(gate, "DataInformationSequence", interval), 0, 1)
     if step is None:
         return Frame(*moment, None, None)
     return Frame(*moment, (slot - 1) * step / 1000, step / 1000)
+
+
+def _seconds(item: Any) -> float | None:
+    """Duration of a frame in s; None if the item has none, or 0, as some programs write."""
+    if (duration := _number("ActualFrameDuration", item, 0, 1)) is not None and duration < 0:
+        raise ValueError(f"ActualFrameDuration is not negative, got {duration:g} ms")
+    return duration / 1000 if duration else None
 
 
 def _item(dataset: Any, name: str, index: int) -> Any:

@@ -40,7 +40,7 @@ class NmViews(ProjectionStack):
     """Counts of a DICOM NM file, sorted by detector, rotation and angular view.
 
     The detectors measure together, one angular view after the other without the time between them,
-    which NM does not have. The duration of a gated frame, a part of each cycle, is unknown.
+    which NM does not have.
 
     Args:
         path: path of the file.
@@ -56,11 +56,11 @@ class NmViews(ProjectionStack):
     kind = "counts"
     unit = "spect of activity"
     dose = 1.0
+    own_unit = True
 
     def __init__(self, path: Path, dataset: str | None = None):
         frames, studies = zip(*read_frames(path), strict=True)
-        study = studies[0]
-        windows = {f"window{k}": _energies(w) for k, w in enumerate(study.windows, 1)}
+        windows = {f"window{k}": _energies(w) for k, w in enumerate(studies[0].windows, 1)}
         times = {f"frame{k}": _time(frame) for k, frame in enumerate(frames, 1)}
         names = dataset.strip("/").split("/") if dataset else []
         known = [name for name in names if name in (*windows, *times)]
@@ -70,13 +70,14 @@ class NmViews(ProjectionStack):
                 f"{_listed(windows)}; {_listed(times)}, got {dataset!r}"
             )
         window, moment = (_chosen(path, names, words) for words in (windows, times))
-        self._counts = studies[moment].counts[window][0, 0]
+        study = studies[moment]
+        self._counts = study.counts[window][0, 0]
         self.pixel_mm, self.began = study.pixel_mm, study.began
         if len(limits := study.windows[window].limits_kev) == 1:
-            self.width_kev = limits[0][1] - limits[0][0]
-        self.duration_s = _duration(path, study.views, frames)[moment]
+            self.window_kev = limits[0]
+        self.duration_s = _duration(path, study.views)
         if self.duration_s is not None:
-            self.starts_s = _starts(study.views, frames[moment], self.duration_s)
+            self.starts_s = _starts(study.views, frames, moment, self.duration_s)
         self._angles = [view.angle_degrees for view in study.views]
         views = [f"detector {d} rotation {r} view {n}" for d, r, n, *_ in study.views]
         super().__init__(path, views, study.counts[0].shape[-2:], np.dtype("f4"))
@@ -133,23 +134,28 @@ def _time(frame: Frame) -> str:
     return "" if frame.start_s is None else f"from {frame.start_s:g} s for {frame.duration_s:g} s"
 
 
-def _duration(path: Path, views: Sequence[View], frames: Sequence[Frame]) -> list[float | None]:
-    """The duration of each view in s, for each frame; None if unknown."""
-    if len({(frame.rr_interval, frame.time_slot) for frame in frames}) > 1:
-        return [None] * len(frames)
+def _duration(path: Path, views: Sequence[View]) -> float | None:
+    """The duration of every view in s; None if unknown."""
     known = [view.duration_s for view in views if view.duration_s is not None]
     if not known:
-        return [frame.duration_s for frame in frames]
+        return None
     if len(known) < len(views) or max(known) > min(known) * (1 + MAX_DURATION):
         raise Refused(
             f"{path}: expected views of one duration, got {min(known):g} to {max(known):g} s in "
             f"{len(known)} of {len(views)} views; in Python, corrected(A, durations) takes them"
         )
-    return [known[0]] * len(frames)
+    return known[0]
 
 
-def _starts(views: Sequence[View], frame: Frame, duration_s: float) -> list[float]:
-    """The start of each view in s since that of the measurement."""
+def _starts(
+    views: Sequence[View], frames: Sequence[Frame], moment: int, duration_s: float
+) -> list[float] | None:
+    """The start of each view in s since that of the measurement; None if unknown: of frames without
+    phases, or of several angular views, which may follow one another in each frame.
+    """
     turns = sorted({(view.rotation, view.number) for view in views})
-    first = frame.start_s or 0.0
-    return [first + duration_s * turns.index((view.rotation, view.number)) for view in views]
+    first = frames[moment].start_s
+    if len(frames) > 1 and (first is None or len(turns) > 1):
+        return None
+    numbers = (turns.index((view.rotation, view.number)) for view in views)
+    return [(first or 0.0) + duration_s * number for number in numbers]

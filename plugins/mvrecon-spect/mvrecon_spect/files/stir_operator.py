@@ -108,13 +108,15 @@ def _behind(
     shape, x, z = sizes.pop()
     if shape == "round" and x != z:
         raise ValueError(f"Expected round holes as wide as high, got {x:g} and {z:g} mm")
+    table = isinstance(shared.get("response"), str | Path) and shared["response"] != "geometric"
     A = Spect(
         grid,
         cameras,
         diameter_mm=x if shape == "round" else (x, z),
         mu=mu,
         blur=blur,
-        intrinsic_mm=FWHM * system.detector.sigma_mm if blur else 0.0,
+        # a measured response contains the detector's
+        intrinsic_mm=FWHM * system.detector.sigma_mm if blur and not table else 0.0,
         **shared,
     )
     mask = accepted(cameras, openings)

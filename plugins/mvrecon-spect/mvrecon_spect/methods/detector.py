@@ -15,6 +15,7 @@ from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon_spect.methods.corrections import (
+    MAX_HALF_LIVES,
     Read,
     decay_factors,
     live_factors,
@@ -23,6 +24,8 @@ from mvrecon_spect.methods.corrections import (
 
 #: Relative difference of two durations, above that by rounding.
 MAX_DURATION_DIFFERENCE = 1e-3
+#: Photons per decay in one window, at most: two of an annihilation, and some more.
+MAX_PHOTONS = 4
 
 
 def detector(
@@ -62,10 +65,27 @@ def detector(
 
     Raises:
         Refused: a duration, starts or a share that are missing, of another number, or contradict
-            the file.
+            the file; an option that has no effect without another; photons per decay in per cent.
         ValueError: see `uniformity_factors`, `live_factors` and `decay_factors`.
     """
     count, where = views.n_views, views.options.path
+    for option, value, other, needed in (
+        ("smoothing_mm", smoothing_mm, "flood", flood),
+        ("start_s", start_s, "half_life_s", half_life_s),
+        ("reference_s", reference_s, "half_life_s", half_life_s),
+        ("in_window", in_window, "dead_time_us", dead_time_us),
+        ("paralysable", paralysable, "dead_time_us", dead_time_us),
+    ):
+        if value and not needed:
+            raise Refused(
+                f"{where}: expected factors.{other} with {option}={value}, which has no effect "
+                f"without it, got none"
+            )
+    if branching and branching > MAX_PHOTONS:
+        raise Refused(
+            f"{where}: expected factors.branching as photons per decay, at most {MAX_PHOTONS}, got "
+            f"{branching:g}; is it in per cent?"
+        )
     weight = torch.ones(count, *cameras.shape, dtype=torch.float64)
     if flood is not None:
         counts = read(flood, relative=True)[0, 0]
@@ -78,6 +98,11 @@ def detector(
         raise Refused(f"{where}: expected factors.time_s, the duration of a view in s, got none")
     duration = duration or 1.0
     if half_life_s:
+        if duration > MAX_HALF_LIVES * half_life_s:
+            raise Refused(
+                f"{where}: expected views of up to {MAX_HALF_LIVES} half-lives, got {duration:g} s "
+                f"of factors.half_life_s={half_life_s:g}; is it in hours?"
+            )
         starts = _starts(views, start_s)
         decay = decay_factors(starts, [duration] * count, half_life_s, reference_s)
         weight = weight * decay[:, None, None]

@@ -12,6 +12,7 @@ from torch import Tensor
 from mvrecon.core.quantities import NonNegativeInt, PositiveFloat, PositiveInt
 from mvrecon.data.resample import resample
 from mvrecon.data.volume_files import read_volume
+from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.solver import Common, declares
 from mvrecon.operators.operator import Derived, LinearOperator
@@ -97,6 +98,12 @@ def by_rows(K: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
         return K.to_sparse_csr()
 
 
+def _resampled(path: str | Path, grid: Grid) -> Float[Tensor, "d h w"]:
+    """The values in a file above its least, such as air, which it has beyond the file as well."""
+    values, source = read_volume(path)
+    return resample(values - values.min(), source, grid)
+
+
 @declares(data_kind="counts", iterates=True, differentiable=False)
 def kem(
     A: Any,
@@ -121,7 +128,7 @@ def kem(
         counts, iterations, subsets, background, common: see `mlem`; the initial volume is that of
             alpha.
         anatomy: volume on the grid, or the path of a volume such as a CT, which is resampled to the
-            grid; None: the operator's attenuation.
+            grid, with its least value beyond it; None: the operator's attenuation.
         neighbours, reach, width: parameters of K, see `kernel_matrix`; the examples of Wang's
             program have 48 neighbours and width 1.
 
@@ -129,7 +136,7 @@ def kem(
         ValueError: no anatomy, or an anatomy of the wrong shape; see `mlem` and `kernel_matrix`.
     """
     anatomy = A.mu_map() if anatomy is None else anatomy
-    f = resample(*read_volume(anatomy), A.grid) if isinstance(anatomy, str | Path) else anatomy
+    f = _resampled(anatomy, A.grid) if isinstance(anatomy, str | Path) else anatomy
     if f is None or f.shape != A.domain_shape:
         got = None if f is None else tuple(f.shape)
         raise ValueError(f"Expected an anatomy of {tuple(A.domain_shape)} voxels, got {got}")

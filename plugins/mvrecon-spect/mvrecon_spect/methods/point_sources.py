@@ -152,7 +152,8 @@ def image_widths(
         cameras: such as of `fit_point_sources`.
         hole: its sensitivity is that of efficiency one.
         least_counts: least number of counts of an image.
-        photons: emitted in the measurement, of each source; adds the `efficiency`.
+        photons: emitted in the measurement, of each source; adds the `efficiency` and the hole's
+            `area_mm2`.
 
     Raises:
         ValueError: no image that is whole.
@@ -164,7 +165,6 @@ def image_widths(
     index = torch.stack(
         torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), dim=-1
     ).double()
-    area = hole.effective_mm[0] * hole.effective_mm[1] / (16 if hole.round else 4 * math.pi)
     end, table = index.new_tensor([columns - 1, rows - 1]), []
     for s, point in enumerate(points.double()):
         for c, counts in enumerate(views[s].double()):
@@ -193,8 +193,8 @@ def image_widths(
             row = dict(zip(TABLE, (depth, degrees, *widths), strict=True))
             row["distance_mm"] = cameras.distance[c].item()
             if photons is not None:
-                law = photons[s].item() * area * cosine**3 / depth**2
-                row["efficiency"] = total / law
+                law = photons[s].item() * hole.area_mm2 * cosine**3 / (4 * math.pi * depth**2)
+                row |= {"efficiency": total / law, "area_mm2": hole.area_mm2}
             table.append(row)
     if not table:
         raise ValueError(

@@ -24,7 +24,11 @@ from mvrecon.data.resample import resample
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid
-from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
+from mvrecon.kernels.operator import (
+    accumulation_dtype,
+    choose_backend,
+    to_accumulation_dtype,
+)
 from mvrecon.kernels.self_test import Errors
 from mvrecon.operators.memo import FixedGeometry, grid_key, kept
 from mvrecon.operators.operator import (
@@ -178,7 +182,7 @@ class Footprints(FixedGeometry):
             yield slice(0, count), None
             return
         moving = torch.is_grad_enabled() and (mu.requires_grad or self.pose_gradient)
-        size = math.prod(self.fine.shape) * mu.element_size()
+        size = math.prod(self.fine.shape) * accumulation_dtype(mu.dtype).itemsize
         if not (moving or mu.requires_grad or self.pose_gradient) and count * size <= MOST_KEPT:
             yield slice(0, count), self._kept(mu)
             return

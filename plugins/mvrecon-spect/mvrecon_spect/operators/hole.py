@@ -112,6 +112,12 @@ class Hole:
         return tuple(math.sqrt(d * (d + 2 * self.rim) + more) for d in self.sides)
 
     @property
+    def area_mm2(self) -> float:
+        """Effective area for sensitivity, in mm^2."""
+        width, height = self.effective_mm
+        return width * height * (math.pi / 4 if self.round else 1.0)
+
+    @property
     def blurring_mm(self) -> tuple[float, ...]:
         """Effective widths d_re in mm for resolution, along u and v."""
         return tuple(d + math.log(2) * self.rim for d in self.sides)
@@ -125,9 +131,7 @@ class Hole:
         distance = cameras.distance[:, None, None]
         cosine = distance / (end - start).norm(dim=-1)
         area = torch.linalg.cross(cameras.u, cameras.v).norm(dim=-1)[:, None, None]
-        width, height = self.effective_mm
-        share = width * height / 16 if self.round else width * height / (4 * math.pi)
-        weight = share * cosine**4 * area / distance**2
+        weight = self.area_mm2 / (4 * math.pi) * cosine**4 * area / distance**2
         if self.acceptance_degrees is None:
             return weight
         return weight * (cosine >= math.cos(math.radians(self.acceptance_degrees)))

@@ -56,7 +56,8 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
             1/cm), which is resampled to the grid with zeros outside the file.
 
     Warns:
-        UserWarning: values unusual for a patient, such as in another unit.
+        UserWarning: values unusual for a patient, such as in another unit, or a file that ends
+            within matter and within the grid.
 
     Raises:
         TypeError: not a tensor, number or path.
@@ -80,6 +81,7 @@ def attenuation_on(grid: Grid, mu: Float[Tensor, "d h w"] | float | str | Path) 
                 f"it, got all of it elsewhere, in a map about {_point(source.centre)}; look at mm, "
                 f"cm and the axes of the file"
             )
+        _warn_of_cut(values, source, grid, str(mu))
         corners = (grid.to_index(source.corners()) - grid.centre_index).abs()
         if (corners > half + SAME).any():
             return Matter(values, source)
@@ -108,6 +110,22 @@ def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
         f"{name}: expected attenuation in 1/mm (water at 140.5 keV: 0.01536), got {got}; {cause}?",
         stacklevel=4,
     )
+
+
+def _warn_of_cut(values: Float[Tensor, "d h w"], source: Grid, grid: Grid, name: str) -> None:
+    """Warn about a map at whose end there is matter, while the grid goes on."""
+    low, high = source.to_index(grid.corners()).aminmax(dim=0)
+    for axis, (n, step) in enumerate(zip(source.size, source.spacing, strict=True)):
+        for end, beyond in ((0, -0.5 - low[axis]), (n - 1, high[axis] - n + 0.5)):
+            further = step * beyond.item()
+            matter = values.select(2 - axis, end).max() > WATERY
+            if matter and further > max(step, *grid.spacing):
+                warnings.warn(
+                    f"{name}: expected a map of the whole body, got matter at its end along "
+                    f"{'xyz'[axis]}; the grid reaches {further:.3g} mm further, where nothing "
+                    f"attenuates",
+                    stacklevel=4,
+                )
 
 
 def _point(place: Float[Tensor, "3"]) -> str:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
-from mvrecon.kernels.operator import COMPILED, accumulation_dtype
+from mvrecon.kernels.operator import COMPILED, to_accumulation_dtype
 from mvrecon.kernels.threads import parallel_for
 
 #: Pixels beside the detector whose rays are part of a frustum, as a fraction of its width; voxels
@@ -35,13 +35,14 @@ PARTS = 2
 def path_integrals(
     mu: Float[Tensor, "e i j"], matter: Grid, cameras: Cameras, grid: Grid
 ) -> Float[Tensor, "m d h w"]:
-    """Integral of mu along the line from each voxel's centre to each pinhole.
+    """Integral of mu along the line from each voxel's centre to each pinhole, float32 or float64.
 
     Args:
         mu: linear attenuation in 1/mm on the grid `matter`, zero outside it.
         cameras: pinholes.
         grid: the voxels.
     """
+    mu = to_accumulation_dtype(mu)
     fine = matter.refined(PARTS)
     frusta = [_frustum(fine, camera) for camera in cameras]
     moving = mu.requires_grad or any(frustum.start.requires_grad for frustum in frusta)
@@ -124,9 +125,8 @@ def _compiled(
     """By compiled loops, one pinhole at a time on each thread."""
     from mvrecon_spect.kernels.paths import add_up, look_up
 
-    real = accumulation_dtype(mu.dtype)
-    padded = F.pad(mu.detach().to(real), (1, 1) * 3).numpy()
-    result = torch.empty(len(frusta), *grid.shape, dtype=real)
+    padded = F.pad(mu.detach(), (1, 1) * 3).numpy()
+    result = torch.empty(len(frusta), *grid.shape, dtype=mu.dtype)
 
     def work(first: int, last: int) -> None:
         for number in range(first, last):
@@ -140,7 +140,7 @@ def _compiled(
             look_up(sums, places, length.item(), ends, step, result[number].numpy())
 
     parallel_for(work, len(frusta), result.numel())
-    return result.to(mu.dtype)
+    return result
 
 
 def _summed(

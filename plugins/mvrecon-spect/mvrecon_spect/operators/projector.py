@@ -109,7 +109,7 @@ class Spect(Scaled):
         edge = {name: options.pop(name) for name in EDGE if name in options}
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
-        found = response_of(response, hole, cameras, blur, intrinsic_mm)
+        found = response_of(response, hole, cameras, grid, blur, intrinsic_mm)
         support = check_support(options.get("support"), grid)
         attenuation, weight = CaseAttenuation.of(mu), None
         if (method := options.pop("method", FOOTPRINTS)) == FOOTPRINTS:
@@ -183,8 +183,8 @@ class OfCases(Wrapped):
 OBJECT = 0.8
 #: Cells per axis of a grid's box whose centres are tested for visibility by the pinholes.
 COARSE = 32
-#: Tolerance of the width of a pixel in voxels.
-WIDER = 1e-6
+#: Tolerance of the width of a pixel in voxels, and cosine of the angle between rows and columns.
+WIDER, SKEW = 1e-6, 0.01
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
 #: Options that determine the tables of an operator, which assignment would not change.
@@ -195,13 +195,19 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
     """Check that cameras are pinholes outside the object, with the detector behind them.
 
     Raises:
-        ValueError: parallel beams, a wrong extent of the rays, a pinhole inside the ellipsoid
-            inscribed in the grid's box (except near its surface), or a pinhole with the entire grid
-            on its detector's side, whose views are zero.
+        ValueError: parallel beams, a wrong extent of the rays, pixels that are not rectangular, a
+            pinhole inside the ellipsoid inscribed in the grid's box (except near its surface), or a
+            pinhole with the entire grid on its detector's side, whose views are zero.
     """
     if cameras.extent != "behind" or cameras.parallel:
         kind = "parallel" if cameras.parallel else cameras.extent
         raise ValueError(f"Pinhole SPECT needs central cameras of extent 'behind', got {kind!r}")
+    skew = torch.cosine_similarity(cameras.u.detach(), cameras.v.detach(), dim=1).abs()
+    if skew.max() > SKEW:
+        raise ValueError(
+            f"Expected detectors of rectangular pixels, got rows and columns of camera "
+            f"{int(skew.argmax())} at {torch.rad2deg(skew.max().acos()).item():.3g} degrees"
+        )
     place = cameras.source.detach() - grid.centre.to(cameras.source)
     voxels = place @ torch.linalg.inv(grid.affine[:3, :3]).to(place).T
     place = (voxels / (voxels.new_tensor(grid.size) / 2)).norm(dim=1)

@@ -8,12 +8,15 @@ images along the tangent of the angle to the axis.
 
 import csv
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -59,15 +62,24 @@ ResponseOption = Literal["geometric"] | str | Path | Mapping[str, Any]
 
 #: Angles at which parts of a response are evaluated, between the axis and a detector's corner.
 ANGLES = 33
+#: Least difference of magnifications, relative to the greatest, and of angles in degrees, for a
+#: further term of a table's polynomials.
+APART, DEGREES_APART = 0.05, 3.0
+#: Magnifications beyond those of a table, as a ratio, from which a warning is given; points of a
+#: grid, along each axis, where its polynomials are evaluated.
+MAX_BEYOND, PLACES = 1.25, 9
 #: Columns of a table of a measured response.
 TABLE = ("depth_mm", "angle_degrees", "fwhm_radial_mm", "fwhm_tangential_mm")
-OPTIONAL = ("distance_mm", "efficiency")
+OPTIONAL = ("distance_mm", "efficiency", "area_mm2")
+#: Relative difference of the areas of a hole, for rounding.
+MAX_AREA_DIFFERENCE = 0.01
 
 
 def response_of(
     option: ResponseOption,
     hole: Hole,
     cameras: Cameras,
+    grid: Grid,
     blur: bool = True,
     intrinsic_mm: float = 0.0,
 ) -> Response:
@@ -79,6 +91,7 @@ def response_of(
             the path of a table, see `measured`.
         hole: a pinhole with its penetration.
         cameras: the pinholes.
+        grid: the voxels, which a table must cover.
         blur: whether there is any.
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
 
@@ -112,7 +125,7 @@ def response_of(
             f"Expected no intrinsic FWHM with a measured response, which contains it, got "
             f"{intrinsic_mm} mm"
         )
-    return measured(Path(option), cameras)
+    return measured(Path(option), hole, cameras, grid)
 
 
 def geometric(hole: Hole, intrinsic_mm: float) -> Response:
@@ -193,24 +206,38 @@ def _least_cosine(cameras: Cameras) -> float:
 
 def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
     """Coefficients of 1, t, .. that fit values best."""
-    powers = torch.stack([t**n for n in range(terms)], dim=1)
-    return torch.linalg.lstsq(powers, values[:, None]).solution[:, 0]
+    return _solved(torch.stack([t**n for n in range(terms)], dim=1), values)
 
 
-def measured(path: Path, cameras: Cameras) -> Response:
+def _solved(rows: Float[Tensor, "n k"], values: Float[Tensor, " n"]) -> Float[Tensor, " k"]:
+    """Least squares."""
+    return torch.linalg.lstsq(rows, values[:, None]).solution[:, 0]
+
+
+def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
     """A response from widths of the images of point sources, of Gaussian shape.
 
     Args:
         path: a table with a row for each source: its distance `depth_mm` from the hole's plane and
             `angle_degrees` from the axis, `fwhm_radial_mm` and `fwhm_tangential_mm` of its image on
-            the detector, and optionally `efficiency`, counts over those of the law, and
+            the detector, and optionally `efficiency`, counts over those of the law, `area_mm2`,
+            that of the hole in this law, which is compared, and
             `distance_mm` l from hole to detector, if that is not of all cameras. Variances are
             fitted in l / depth and 1 - cos, of as many terms as there are depths and
-            angles, at most three and two.
+            angles that differ by `APART` and `DEGREES_APART`, at most three and two, and fewer
+            where the variances were not positive in the whole grid.
+        hole: its sensitivity is the law's.
         cameras: a rig with one distance from hole to detector, unless the table has it.
+        grid: the voxels.
 
     Raises:
-        ValueError: missing or unknown columns, impossible values, or several distances.
+        ValueError: missing or unknown columns, impossible values, several distances, efficiencies
+            of another hole, or widths or
+            efficiencies of voxels in a detector's field that are not positive, beyond the table's
+            depths and angles.
+
+    Warns:
+        UserWarning: voxels far beyond the table's depths.
     """
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -236,28 +263,118 @@ def measured(path: Path, cameras: Cameras) -> Response:
     else:
         lengths = lengths[0].expand_as(depth)
     positive = torch.stack([depth, radial, tangential, lengths])
-    if not (positive > 0).all() or not (angle.abs() < 90).all() or not positive.isfinite().all():
-        raise ValueError(f"{path}: expected positive mm, and angles below 90 degrees")
+    numbers = torch.tensor([*columns.values()], dtype=torch.float64)
+    if not (positive > 0).all() or not (angle.abs() < 90).all() or not numbers.isfinite().all():
+        raise ValueError(f"{path}: expected finite, positive mm, and angles below 90 degrees")
+    for area in set(columns.get("area_mm2", ())):
+        if not abs(area / hole.area_mm2 - 1) <= MAX_AREA_DIFFERENCE:
+            raise ValueError(
+                f"{path}: expected the hole of its efficiencies, of {area:g} mm^2 "
+                f"({math.sqrt(4 * area / math.pi):.3g} mm wide if round), got one of "
+                f"{hole.area_mm2:.4g} mm^2 with its penetration; set the diameter, and no "
+                f"collimator_mu, which measured efficiencies contain"
+            )
     m, cosine = lengths / depth, torch.deg2rad(angle).cos()
     t, tangent2 = 1 - cosine, 1 / cosine**2 - 1
-    depths, angles = min(len(m.unique()), 3), min(len(angle.abs().unique()), 2)
-    used = [3 * j + i for j in range(angles) for i in range(depths)]
-    terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)[:, used]
+    depths, angles = _apart(m, APART * m.max().item()), _apart(angle.abs(), DEGREES_APART)
+    terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)
+    field = _field(cameras, grid)
+    _warn_of_depths(path, m, field.terms[:, 1])
 
-    def fitted(values: Tensor, rows: Tensor) -> tuple[float, ...]:
-        coefficients = torch.zeros(6, dtype=torch.float64)
-        coefficients[used] = torch.linalg.lstsq(rows, values[:, None]).solution[:, 0]
-        return tuple(coefficients.tolist())
+    def widths(orders: tuple[int, int]) -> tuple[Tensor, Tensor]:
+        """Coefficients of variances by so many terms of the depth and of the angle."""
+        used = [3 * j + i for j in range(orders[1]) for i in range(orders[0])]
+        detector, smear = torch.zeros(2, 6, dtype=torch.float64)
+        detector[used] = _solved(terms[:, used], (tangential / FWHM) ** 2)
+        if angle.abs().max() >= DEGREES_APART:  # on the axis, radial is no direction
+            rows = terms[:, used] * tangent2[:, None]
+            smear[used] = _solved(rows, (radial**2 - tangential**2) / FWHM**2)
+        return detector, smear
 
-    detector = fitted((tangential / FWHM) ** 2, terms)
-    more = (radial**2 - tangential**2) / FWHM**2
-    smear = fitted(more, terms * tangent2[:, None]) if angles > 1 else (0.0,) * 6
-    efficiency = (1.0, 0.0, 0.0)
+    orders = product(range(min(depths, 3), 0, -1), range(min(angles, 2), 0, -1))
+    fits = map(widths, sorted(orders, key=sum, reverse=True))
+    detector, smear = _first_positive(path, "widths", fits, lambda fit: field.variances(*fit))
+    efficiency = torch.tensor([1.0, 0.0, 0.0])
     if "efficiency" in columns:
         values = torch.tensor(columns["efficiency"], dtype=torch.float64)
-        fit = _polynomial(t, values, min(len(angle.abs().unique()), 3)).tolist()
-        efficiency = (*fit, 0.0, 0.0)[:3]
-    return Response(detector=detector, radial=smear, efficiency=efficiency)
+        counts = range(min(angles, 3), 0, -1)
+        fits = (F.pad(_polynomial(t, values, count), (0, 3 - count)) for count in counts)
+        efficiency = _first_positive(path, "efficiencies", fits, field.efficiencies)
+    parts = (tuple(part.tolist()) for part in (detector, smear, efficiency))
+    return Response(**dict(zip(("detector", "radial", "efficiency"), parts, strict=True)))
+
+
+def _apart(values: Float[Tensor, " n"], least: float) -> int:
+    """How many of the values, from the least up, differ by so much from the one before."""
+    count, last = 0, -math.inf
+    for value in values.sort().values.tolist():
+        if value - last >= least:
+            count, last = count + 1, value
+    return count
+
+
+class _Field(NamedTuple):
+    """Points of a grid in the field of a detector: 1, m, m^2, t, t m, t m^2 of each, and its
+    squared tangents along u and v.
+    """
+
+    terms: Float[Tensor, "p 6"]
+    tangents2: Float[Tensor, "p 2"]
+
+    def variances(self, detector: Tensor, radial: Tensor) -> Float[Tensor, "p 2"]:
+        """Variances along u and v in mm^2."""
+        terms = self.terms.to(detector)
+        return (terms @ detector)[:, None] + (terms @ radial)[:, None] * self.tangents2
+
+    def efficiencies(self, coefficients: Float[Tensor, "3"]) -> Float[Tensor, " p"]:
+        """By 1, t, t^2."""
+        t = self.terms[:, 3]
+        return torch.stack([t**0, t, t**2], dim=1) @ coefficients.to(t)
+
+
+def _field(cameras: Cameras, grid: Grid) -> _Field:
+    """Points of a grid, before all pinholes in whose detector's field they are."""
+    axes = [torch.linspace(0, n - 1, PLACES, dtype=torch.float64) for n in grid.size]
+    images = cameras.project(grid.to_world(torch.cartesian_prod(*axes)).to(cameras.source))
+    pixels, length = images.detach()[..., :2], cameras.distance.detach()[:, None]
+    end = pixels.new_tensor(cameras.shape[::-1]) - 0.5
+    seen = (images[..., 2] < 0) & ((pixels > -0.5) & (pixels < end)).all(dim=-1)
+    steps = torch.stack([cameras.u, cameras.v], dim=1).detach()
+    beam = pixels @ steps + (cameras.origin - cameras.source).detach()[:, None]
+    tangents = beam @ (steps / steps.norm(dim=-1, keepdim=True)).mT / length[..., None]
+    m = (-length / images.detach()[..., 2])[seen]
+    t = (1 - length / beam.norm(dim=-1))[seen]
+    return _Field(torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1), tangents[seen] ** 2)
+
+
+def _warn_of_depths(path: Path, known: Float[Tensor, " n"], asked: Float[Tensor, " p"]) -> None:
+    """Warn about a grid far beyond the magnifications of a table."""
+    if not asked.numel():
+        return
+    (low, high), (least, most) = known.aminmax(), asked.aminmax()
+    if most > MAX_BEYOND * high or MAX_BEYOND * least < low:
+        warnings.warn(
+            f"{path}: expected sources at the depths of the grid, of magnifications l / depth of "
+            f"{least:.3g} to {most:.3g}, got {low:.3g} to {high:.3g}; widths are extrapolated",
+            stacklevel=4,
+        )
+
+
+def _first_positive(
+    path: Path, what: str, fits: Iterable[Any], values_of: Callable[[Any], Tensor]
+) -> Any:
+    """The first of several fits with positive values in the whole field.
+
+    Raises:
+        ValueError: there is none.
+    """
+    for fit in fits:
+        if (values_of(fit) > 0).all():
+            return fit
+    raise ValueError(
+        f"{path}: expected positive {what} of all voxels in the detectors' fields, got others by "
+        f"each fit of the table; add sources at their depths and angles, or make the grid smaller"
+    )
 
 
 def record_of(
@@ -282,8 +399,7 @@ def record_of(
     secant = torch.stack(products, dim=1) / length[:, None] ** 2
     pitch = torch.stack([u.norm(dim=1), v.norm(dim=1)], dim=1)
     feet = torch.stack([_dot(foot, u), _dot(foot, v)], dim=1) / pitch**2
-    width, height = hole.effective_mm
-    area = width * height / 16 if hole.round else width * height / (4 * math.pi)
+    area = hole.area_mm2 / (4 * math.pi)
     degrees = hole.acceptance_degrees
     least = -1.0 if degrees is None else math.cos(math.radians(degrees))
     every = torch.ones_like(length)[:, None]
