@@ -20,12 +20,10 @@ from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import (
     MAX_YAML_BYTES,
-    TYPED,
     Refused,
-    as_typed,
+    file_in,
     from_home,
     text_of,
-    typed_in,
     yaml_of,
 )
 from mvrecon.core.options import with_paths
@@ -57,11 +55,7 @@ def _from_folder(folder: Path, path: str) -> str:
     """
     whole, (head, sign, name) = from_home(path), str(path).rpartition(":")
     if not whole.exists() and not sign:
-        return as_typed(path)
-    start, mark, typed = str(path).rpartition(TYPED)
-    if mark and whole.exists():  # and a data set may have this name
-        between = os.path.relpath(Path(start).resolve(), folder.resolve())
-        return typed if between == "." else f"{between}{TYPED}{typed}"
+        return path
     place, rest = (whole, "") if whole.exists() else (from_home(head), sign + name)
     return os.path.relpath(place.resolve(), folder.resolve()) + rest
 
@@ -126,8 +120,9 @@ def _settings(file: Path) -> Iterator[str]:
         told["camera"] = {"name": "from_file"} | told["camera"]
 
     def from_file(path: str, marks: tuple) -> str | Path:
-        inside = INSIDE_MARK in marks and not Path(path).is_absolute()
-        return typed_in(file.parent, path) if inside else file.parent / path
+        if INSIDE_MARK in marks:
+            return file_in(file.parent, path) or path
+        return file.parent / path
 
     told = with_paths(told, ReconstructSettings, from_file)
     for section, options in told.items():
@@ -151,10 +146,10 @@ def _word(file: Path, key: str, value: Any) -> str:
     """A value as on a command line."""
     if isinstance(value, list):
         return f"[{','.join(_word(file, key, inner) for inner in value)}]"
-    if isinstance(value, Path) or TYPED in str(value):
+    if isinstance(value, Path):
         told = str(value).removeprefix(f"{file.parent.absolute()}/").removeprefix(f"{file.parent}/")
-        if "${" not in told and (Path(value).exists() or NAMED.fullmatch(told)):
-            return str(value.absolute() if isinstance(value, Path) else value)
+        if "${" not in told and (value.exists() or NAMED.fullmatch(told)):
+            return str(value.absolute())
     elif value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     elif isinstance(value, str | int | float) and WORD.fullmatch(str(value)):

@@ -21,9 +21,9 @@ Triple: TypeAlias = Annotated[Sequence[T], Len(3, 3)]
 
 #: Marks a path that may also be the name of weights that mvrecon ships.
 WEIGHTS_MARK = "weights"
-#: Marks a path that may also be the name of a data set in a scan's own file, which comes first.
+#: Marks a path that is the name of a data set in the scan's own file unless it is that of a file.
 INSIDE_MARK = "inside"
 #: A path of weights, or their name.
 WeightsFile: TypeAlias = Annotated[str | Path, WEIGHTS_MARK]
-#: A data set's name in the scan's file, or a path.
+#: A path, or the name of a data set in the scan's file.
 InsideOrFile: TypeAlias = Annotated[str | Path, INSIDE_MARK]

@@ -39,7 +39,7 @@ from mvrecon.apps.config.errors import one_line, reported
 from mvrecon.apps.config.grammar import MULTIRUN, CommandLine
 from mvrecon.apps.config.help import help_text
 from mvrecon.apps.settings import RECORDS
-from mvrecon.core.files.checks import from_home, typed_in
+from mvrecon.core.files.checks import file_in, from_home
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
 from mvrecon.core.options import (
@@ -308,7 +308,7 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
 
     def absolute(path: str, marks: tuple) -> str:
         if INSIDE_MARK in marks:
-            return typed_in(Path.cwd(), path)
+            return str(file_in(Path.cwd(), path) or path)
         return str(of_weights(path) if WEIGHTS_MARK in marks else from_home(path).absolute())
 
     return with_paths(settings, record, absolute)

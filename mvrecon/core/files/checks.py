@@ -161,21 +161,15 @@ def from_home(path: str | os.PathLike[str]) -> Path:
     return Path(os.path.expanduser(path))
 
 
-#: Between a folder and what was typed there, in a path; `Path` takes it for a single slash.
-TYPED = "/./"
-
-
-def typed_in(folder: Path, path: str) -> str:
-    """An absolute path, of which `as_typed` returns what was typed in a folder: it may be a name
-    inside a file instead.
+def file_in(folder: Path, path: str) -> Path | None:
+    """A file as a path begins in a folder, or a data set as <file>:<name>; None of what is no file
+    there.
     """
-    path = os.path.expanduser(path)
-    return path if os.path.isabs(path) else f"{folder.absolute()}{TYPED}{path}"
-
-
-def as_typed(path: str | Path) -> str:
-    """What was typed in a folder, see `typed_in`; other paths as they are."""
-    return str(path).rpartition(TYPED)[2]
+    head, sign, name = path.rpartition(":")
+    if (whole := folder.absolute() / from_home(path)).exists():
+        return whole
+    place = folder.absolute() / from_home(head)
+    return Path(f"{place}:{name}") if sign and place.is_file() else None
 
 
 def plain_name(name: Any, where: str | Path) -> str:

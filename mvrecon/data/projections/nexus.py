@@ -13,7 +13,6 @@ import numpy as np
 
 from mvrecon.core.files.checks import (
     Refused,
-    as_typed,
     check_file,
     file_errors,
     millimetres,
@@ -177,13 +176,13 @@ def named(path: Path, name: str | Path) -> Place:
     Raises:
         Refused: there is none.
     """
-    if place := followed(path, as_typed(name), EXPECTED) or in_another(name):
+    if place := followed(path, str(name), EXPECTED) or in_another(name):
         return place
     other, own = Path(name).expanduser(), listing(path, EXPECTED)
     file = f"nor is there a file {other}; the first contains {own}"
     if other.is_file():
         file = f"and {other} is a file: name its data set by {other}:/<name>, or one of {own}"
-    raise Refused(f"{path}: has no data set {as_typed(name)}, {file}")
+    raise Refused(f"{path}: has no data set {name}, {file}")
 
 
 def in_another(name: str | Path) -> Place | None:

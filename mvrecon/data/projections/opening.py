@@ -12,7 +12,7 @@ from h5py import Dataset
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, as_typed, check_file, file_errors
+from mvrecon.core.files.checks import Refused, check_file, file_errors
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file, same
 from mvrecon.data.linked import Place, followed, listing, values_at
@@ -163,7 +163,7 @@ def exposures(
             ) from error
     if len(values) != stack.n_views or not (np.isfinite(values) & (values > 0)).all():
         raise Refused(
-            f"{as_typed(path)}: expected a positive exposure for each of {stack.n_views} views on "
+            f"{path}: expected a positive exposure for each of {stack.n_views} views on "
             f"disk, relative to the flat field's, got {len(values)} from {values.min():.4g} to "
             f"{values.max():.4g}"
         )
@@ -275,9 +275,10 @@ def _field_at(
 
 
 def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:
-    """The data set of a name in the scan's file, if any."""
-    place = None if views.scan is None else followed(views.scan, as_typed(name), EXPECTED)
-    if place is None:
+    """The data set of a name in the scan's file, if any; None of a name that is a file."""
+    if views.scan is None or Path(name).expanduser().exists():
+        return None
+    if (place := followed(views.scan, str(name), EXPECTED)) is None:
         return None
     with opened(place.path, EXPECTED) as file:
         return place if isinstance(file[place.name], Dataset) else None
@@ -288,4 +289,4 @@ def _absent(views: ProjectionStack, name: str | Path) -> str:
     if views.scan is None:
         return ""
     contained = listing(views.scan, EXPECTED)
-    return f"; {views.scan} has no data set {as_typed(name)}, it contains {contained}"
+    return f"; {views.scan} has no data set {name}, it contains {contained}"
