@@ -16,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from mvrecon.apps.config.grammar import quoted
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import MAX_YAML_BYTES, Refused, from_home, text_of, yaml_of
@@ -27,8 +28,12 @@ NAME, KEY = "scan.yaml", "scan"
 SECTIONS = ("views", "camera", "projector", "grid")
 #: Options of views that name a data set of their file, or as <file>:<name> one of another.
 DATA_SETS = ("angles", "image_key")
+#: Options that are a text of any characters, but those that control a terminal.
+TEXTS = ("views.pattern", "views.dataset")
 #: Values: numbers, words, products of names or patterns of them, and paths; nothing that refers.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
+#: Numbers without a point or the sign of their exponent, which are texts in YAML.
+NUMBER = re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+")
 #: What OmegaConf would resolve, outside of comments.
 REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
 
@@ -116,11 +121,17 @@ def _settings(file: Path) -> Iterator[str]:
     for key in {*DATA_SETS} & {*views}:
         if isinstance(name := views[key], str) and ":" not in name:
             views[key] = f"/{name.lstrip('/')}"  # else a file beside this one
-    told = with_paths(told, ReconstructSettings, lambda path, _: file.parent / path)
+    told = with_paths(told, ReconstructSettings, lambda path, _: _beside(file, path))
     for section, options in told.items():
         if (name := options.pop("name", "from_file")) != "from_file":
             yield f"{section}={_word(file, section, name)}"
         yield from _lines(file, section, options)
+
+
+def _beside(file: Path, path: str) -> str | Path:
+    """A path of a file, or a number that YAML takes for a text."""
+    place = file.parent / from_home(path)
+    return path if NUMBER.fullmatch(path) and not place.exists() else place
 
 
 def _lines(file: Path, key: str, value: Any) -> Iterator[str]:
@@ -146,4 +157,6 @@ def _word(file: Path, key: str, value: Any) -> str:
         return "null" if value is None else str(value).lower()
     elif isinstance(value, str | int | float) and WORD.fullmatch(str(value)):
         return str(value)
+    elif isinstance(value, str) and key in TEXTS and value.isprintable() and "${" not in value:
+        return quoted(value)
     raise Refused(f"{file}: expected a number, a word or a file as {key}, got {str(value)!r}")

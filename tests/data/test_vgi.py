@@ -30,7 +30,7 @@ def vgi(folder, kind="float", bits=32, unit="mm", values=FLOATS, **changed):
         place, _, key = name.partition(".")
         lines += [f"[{place}]"] * (place != section) + [f"{key} = {value}"]
         section = place
-    (folder / "a.vgi").write_text("\n".join(lines))
+    (folder / "a.vgi").write_text("\n".join(lines), encoding="utf-8")
     values.tofile(folder / "a.vol")
     return folder / "a.vgi"
 
@@ -45,6 +45,13 @@ def test_a_volume_of_vgstudio_has_its_values_and_voxels(kind, bits, dtype, tmp_p
     assert grid.spacing == (0.5, 0.25, 2.0) and np.allclose(grid.centre, 0)
     _, grid = read_volume(vgi(tmp_path, unit="um", geometry__resolution="500 250 2000"))
     assert np.allclose(grid.spacing, (0.5, 0.25, 2.0))
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig"])
+def test_a_unit_of_vgstudio_is_read_in_any_encoding(encoding, tmp_path):
+    path = vgi(tmp_path, unit="µm", geometry__resolution="500 250 2000")
+    path.write_bytes(path.read_text(encoding="utf-8").encode(encoding))
+    assert np.allclose(read_volume(path)[1].spacing, (0.5, 0.25, 2.0))
 
 
 def _ranged(text, **changed):

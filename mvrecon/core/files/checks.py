@@ -73,7 +73,7 @@ def millimetres(where: object, unit: str) -> float:
 
 
 def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict") -> str:
-    """The UTF-8 text of a file.
+    """The UTF-8 text of a file, without the mark of its encoding that some programs put before it.
 
     Args:
         path: path of the file.
@@ -89,7 +89,7 @@ def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict
     if len(raw) > limit:
         raise Refused(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
     try:
-        return raw.decode("utf-8", errors)
+        return raw.decode("utf-8-sig", errors)
     except UnicodeDecodeError as error:
         raise Refused(f"{path}: is not UTF-8 text ({error})") from error
 

@@ -37,7 +37,7 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
 
     Warns:
         UserWarning: names that differ in more than their numbers; they are sorted as text. Or all
-            numbers are negative.
+            numbers are negative, or decimals that may be several integers have unequal steps.
 
     Raises:
         Refused: two names with the same numbers, a missing number, numbers that may be read in two
@@ -53,7 +53,8 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     counted = any(len(part) > 1 and part.endswith("0") for part in places)
     number = INTEGER if counted and len({*map(len, places)}) > 1 else f"{DECIMAL}|{INTEGER}"
     mixed_up = any(re.search(SCIENTIFIC, path.stem.lower()) for path in paths)  # 1e-1 and 1e0
-    number = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}{number}"
+    exponents = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}"
+    number = f"{exponents}{number}"
     files, parts, keys = _sorted(paths, number)
     for other in (EXPONENT, COMMA):
         found = filter(None, (re.search(other, path.stem.lower()) for path in files))
@@ -95,8 +96,17 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
                 f"{where}: expected one file of every number, got {shown(first.name)} and "
                 f"{shown(second.name)}"
             )
-    if not gaps:
+    try:
         check_steps(where, [keys[path][1::2] for path in files])  # type: ignore[misc]
+    except Refused:
+        if not gaps:
+            raise
+        if _sorted(paths, f"{exponents}{INTEGER}")[0] != files:  # which no steps contradict
+            warnings.warn(
+                f"{where}: the numbers in the names of the views are taken for decimals: "
+                f"{', '.join(path.name for path in files[:4])}, ...",
+                stacklevel=2,
+            )
     return files
 
 

@@ -215,6 +215,28 @@ def test_a_view_missing_among_decimals_or_pairs_of_numbers_is_reported(names, tm
     assert sorted(ordered(paths, gaps=True)) == sorted(paths)
 
 
+@pytest.mark.parametrize(
+    ("names", "warned"),
+    [
+        (["s1.11", "s1.8", "s1.9"], True),
+        (["s1.1", "s1.11", "s1.13", "s1.3"], True),
+        (["a_0.25", "a_0.5", "a_1.75"], True),
+        (["a_0.25", "a_0.5", "a_0.75", "a_1.0"], False),
+        (["a_2.36", "a_6.19", "a_11.02"], False),
+        (["a_1", "a_3", "a_11"], False),
+    ],
+)
+def test_decimals_that_may_be_two_numbers_are_named_where_no_steps_tell_them(
+    names, warned, tmp_path
+):
+    """With gaps that are allowed; s1.11 may be the image 11 of the scan 1."""
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert ordered(paths[::-1], gaps=True) == paths
+    assert ["taken for decimals" in str(one.message) for one in caught] == [True] * warned
+
+
 def test_an_index_beside_another_number_shows_that_no_view_is_missing(tmp_path):
     paths = [tmp_path / f"a{k}_t{t}.tif" for k, t in enumerate((3, 8, 9, 17))]
     assert ordered(paths[::-1]) == paths
