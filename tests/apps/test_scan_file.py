@@ -182,7 +182,7 @@ def test_names_of_exposures_are_no_paths(name: str, folder: Path, monkeypatch):
 
 @pytest.mark.parametrize("pattern", ["scan [0-9]*.tif", "a, (b) = {c}_*", "it's \"*", "view_*.tif"])
 def test_patterns_and_names_of_data_sets_are_kept_with_any_characters(pattern: str, folder: Path):
-    """As `save` writes them and Hydra reads them; what refers, or controls terminals, is refused."""
+    """As `save` writes them and Hydra reads them; what refers or controls terminals is refused."""
     views = {"pattern": pattern, "dataset": f"/entry/{pattern}"}
     save(folder / NAME, {"views": views})
     told = OverridesParser.create().parse_overrides(expanded([f"scan={folder}"]))
