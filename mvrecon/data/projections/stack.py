@@ -246,6 +246,9 @@ class NpyViews(ProjectionStack):
         super().__init__(path, names, self._array.shape[1:], self._array.dtype)
 
     def _block(self, first: int, last: int) -> np.ndarray:
+        needed = self._array.offset + self._array.nbytes
+        if (got := self.path.stat().st_size) < needed:  # reading it would end the process
+            raise Refused(f"{self.path}: expected {needed} bytes, as before, got {got}")
         return self._array[first:last]
 
 

@@ -1,5 +1,6 @@
 """Whatever form a scan has on disk, its views are the same numbers in the same order."""
 
+import os
 import struct
 import warnings
 import zlib
@@ -235,6 +236,16 @@ def test_decimals_that_may_be_two_numbers_are_named_where_no_steps_tell_them(
         warnings.simplefilter("always")
         assert ordered(paths[::-1], gaps=True) == paths
     assert ["taken for decimals" in str(one.message) for one in caught] == [True] * warned
+
+
+def test_an_array_that_is_cut_short_while_it_is_read_is_refused(tmp_path):
+    """Reading it would end the process; also tried: arrays in the order of Fortran, one view."""
+    np.save(tmp_path / "a.npy", np.ones((4, 64, 64), "f4"))
+    stack = open_projections(tmp_path / "a.npy")
+    assert stack.read(3, 4).eq(1).all()
+    os.truncate(tmp_path / "a.npy", 1000)
+    with pytest.raises(Refused, match=r"a.npy: expected \d+ bytes, as before, got 1000"):
+        stack.read(3, 4)
 
 
 def test_an_index_beside_another_number_shows_that_no_view_is_missing(tmp_path):
