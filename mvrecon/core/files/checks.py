@@ -206,6 +206,19 @@ def file_beside(header: Path, stated: str) -> Path:
     return path
 
 
+def check_link(path: Path) -> None:
+    """Check that a path is no link to what is not there, as of a file that was not fetched.
+
+    Raises:
+        FileNotFoundError: it is.
+    """
+    if path.is_symlink() and not path.exists():
+        raise FileNotFoundError(
+            f"{path}: is a link to {path.readlink()}, which is not there; fetch it, or remove "
+            f"the link"
+        )
+
+
 def check_file(path: Path, expected: str) -> None:
     """Check that a path is an existing file.
 

@@ -18,7 +18,7 @@ from mvrecon.data.projections.images import INTERLACED, PLAIN
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.ordering import ordered
 from mvrecon.data.volume_files import read_volume
-from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
+from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey, images
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -236,6 +236,21 @@ def test_decimals_that_may_be_two_numbers_are_named_where_no_steps_tell_them(
         warnings.simplefilter("always")
         assert ordered(paths[::-1], gaps=True) == paths
     assert ["taken for decimals" in str(one.message) for one in caught] == [True] * warned
+
+
+@pytest.mark.parametrize("name", ["view_4.tif", "view_4.TIFF", "4.png", "4.dcm", "4.his"])
+def test_a_link_to_a_view_that_was_not_fetched_is_refused(name, tmp_path):
+    """As in repositories of large files: without the last view, all others have other angles."""
+    folder = images(tmp_path / "scan", grey()[:4])
+    try:
+        (folder / name).symlink_to("../.git/annex/objects/a")
+    except OSError:
+        pytest.skip("needs symbolic links")
+    with pytest.raises(FileNotFoundError, match=f"{name}: is a link to .*, which is not there"):
+        open_projections(folder)
+    (folder / name).rename(folder / "notes.txt")
+    (folder / "._view_9.tif").symlink_to("elsewhere.tif")
+    assert open_projections(folder).n_views == 4
 
 
 def test_an_array_that_is_cut_short_while_it_is_read_is_refused(tmp_path):
