@@ -16,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from mvrecon.apps.config.grammar import quoted
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import (
@@ -33,8 +34,12 @@ from mvrecon.core.registry import hint
 NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
+#: Options that are a text of any characters, but those that control a terminal.
+TEXTS = ("views.pattern", "views.dataset")
 #: Values: numbers, words, products of names or patterns of them, and paths; nothing that refers.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
+#: Numbers without a point or the sign of their exponent, which are texts in YAML.
+NUMBER = re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+")
 #: What OmegaConf would resolve, outside of comments.
 REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
 
@@ -120,9 +125,10 @@ def _settings(file: Path) -> Iterator[str]:
         told["camera"] = {"name": "from_file"} | told["camera"]
 
     def from_file(path: str, marks: tuple) -> str | Path:
-        if INSIDE_MARK in marks:
-            return file_in(file.parent, path) or path
-        return file.parent / path
+        if (found := file_in(file.parent, path)) is not None:
+            return found
+        text = INSIDE_MARK in marks or NUMBER.fullmatch(path)
+        return path if text else file.parent / from_home(path)
 
     told = with_paths(told, ReconstructSettings, from_file)
     for section, options in told.items():
@@ -154,4 +160,6 @@ def _word(file: Path, key: str, value: Any) -> str:
         return "null" if value is None else str(value).lower()
     elif isinstance(value, str | int | float) and WORD.fullmatch(str(value)):
         return str(value)
+    elif isinstance(value, str) and key in TEXTS and value.isprintable() and "${" not in value:
+        return quoted(value)
     raise Refused(f"{file}: expected a number, a word or a file as {key}, got {str(value)!r}")

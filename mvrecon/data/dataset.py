@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NotRequired
 
-import h5py
 import torch
 from jaxtyping import Bool, Float
 from rich.console import Console
@@ -17,14 +16,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 from typing_extensions import TypedDict
 
-from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import rank
 from mvrecon.core.numbers import case_numbers, generator, mixed
 from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.data.digests import of_grid, of_rig
 from mvrecon.data.scenes.sample import Sample, Scene
-from mvrecon.data.storage import dataset_in, opened
+from mvrecon.data.storage import dataset_in, opened, written
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
@@ -75,7 +73,7 @@ class CaseStore:
             except Refused:  # cut short or damaged: recompute
                 pass
         sample = make()
-        with written_whole(path) as part, h5py.File(part, "w") as file:
+        with written(path) as file:
             tensors = {"views": sample.views, "volume": sample.volume, "inside": sample.inside}
             for name, tensor in {**tensors, **sample.maps}.items():
                 values, chunks = tensor.cpu().numpy(), (1, *tensor.shape[1:])

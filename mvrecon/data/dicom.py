@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_errors, shown
+from mvrecon.core.files.checks import EDGE, VOLUME, Refused, check_link, file_errors, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.dicom_image import PARTS, DicomImage, dataset_of, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of
@@ -120,6 +120,8 @@ def open_series(folder: str | Path, resample: bool = False) -> tuple[Slabs, Grid
     if not folder.exists():
         raise FileNotFoundError(f"{folder}: no such folder; expected one with a DICOM CT series")
     inside = sorted(folder.iterdir()) if folder.is_dir() else [folder]
+    for path in (path for path in inside if not path.name.startswith(".")):
+        check_link(path)
     files = [path for path in inside if path.is_file() and dicom_file(path)]
     if not files:
         raise FileNotFoundError(f"{folder}: expected the files of a DICOM CT series, got none")

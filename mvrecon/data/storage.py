@@ -1,5 +1,5 @@
 """Safe reading of foreign HDF5 files: data must be in the file itself, and no chunk may unpack to
-more bytes than declared.
+more bytes than declared. And writing of small ones.
 """
 
 import math
@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 import h5py
 import numpy as np
 
+from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import (
     EDGE,
     MAX_CHUNK_BYTES,
@@ -31,6 +32,22 @@ FORMAT = ("v110", "v110")
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 #: Offset that ends a heap's list of free blocks.
 LIST_END = 1
+
+
+@contextmanager
+def written(path: Path) -> Iterator[h5py.File]:
+    """Context of a new HDF5 file, made in memory and then written at once, atomically: libhdf5 does
+    not close a file for which a disk has no space, and crashes when the process ends.
+
+    Raises:
+        OSError: no space, no permission; the message names `path`.
+    """
+    with written_whole(path) as part:
+        with h5py.File(part, "w", driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            image = file.id.get_file_image()
+        part.write_bytes(image)
 
 
 def reading(path: str | Path) -> h5py.File:

@@ -181,10 +181,12 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
 
     def passes() -> Iterator[Slab]:
         step = planes(y * x)
-        with file_errors(data, "cannot be read"):
-            values = np.memmap(data, dtype, "r", skip, (z, y, x))
+        with file_errors(data, "cannot be read"), data.open("rb") as file:
+            file.seek(skip)  # a map of memory would end the process if the file were cut short
             for first in range(0, z, step):
-                slab = torch.from_numpy(values[first : first + step].astype("float32"))
+                shape = (min(step, z - first), y, x)
+                values = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)
+                slab = torch.from_numpy(values.astype("float32"))
                 if not slab.isfinite().all():
                     raise Refused(f"{data}: expected finite values, got NaN or infinite ones")
                 if (least := slab.min().item()) < low or (most := slab.max().item()) > high:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, check_link
 from mvrecon.core.parts import VOLUME_FILES, VOLUME_READERS
 from mvrecon.data import dicom, itk, nifti
 from mvrecon.data.dicom_image import dicom_file
@@ -158,7 +158,7 @@ def volumes_in(path: str | Path) -> list[Path]:
     """Return the volumes at a path, sorted by name: a file, a DICOM series, or a folder of either.
 
     Raises:
-        FileNotFoundError: nothing is there.
+        FileNotFoundError: nothing is there, or a link leads nowhere.
         Refused: a folder without volumes, or with single DICOM files beside other volumes.
     """
     path = Path(path).expanduser()
@@ -167,7 +167,10 @@ def volumes_in(path: str | Path) -> list[Path]:
     if not path.is_dir():
         return [path]
     inside = [item for item in sorted(path.iterdir()) if not item.name.startswith(".")]
-    volumes = [item for item in inside if item.is_file() and ENDING.search(item.name)]
+    named = [item for item in inside if ENDING.search(item.name)]
+    for item in named:
+        check_link(item)
+    volumes = [item for item in named if item.is_file()]
     series = [item for item in inside if item.is_dir() and _has_dicom(item)]
     if _has_dicom(path):
         if volumes or series:

@@ -9,7 +9,6 @@ from importlib.util import find_spec
 from itertools import count
 from pathlib import Path
 
-import h5py
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,6 +19,7 @@ from mvrecon.data.dataset import Batch
 from mvrecon.data.nifti import save_nifti
 from mvrecon.data.projections.stack import MU_FILE
 from mvrecon.data.projections.writing import Exposure, write_projections
+from mvrecon.data.storage import written
 from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz import review
 from mvrecon.report.viz.images import save_png
@@ -97,7 +97,7 @@ def save_views(
         about |= {} if duration_s is None else {"duration": float(duration_s)}
     if bad := int((~values.float().isfinite()).sum()):
         raise ValueError(f"Expected finite views of {name}, got {bad} pixels that are not")
-    with written_whole(case / "views.h5") as part, h5py.File(part, "w") as file:
+    with written(case / "views.h5") as file:
         file.attrs["name"] = name
         stored = values.float().numpy()
         dataset = file.create_dataset("views", data=stored, compression="gzip", shuffle=True)

@@ -5,6 +5,7 @@ is kept elsewhere.
 import errno
 import os
 import shutil
+import sys
 from collections import namedtuple
 from pathlib import Path
 
@@ -111,6 +112,29 @@ def test_a_computed_volume_that_cannot_be_written_is_kept_elsewhere(
     assert failure.strerror in said and kept.is_relative_to(run)
     assert torch.equal(read_volume(kept)[0], read_volume(whole / f"volume.{ending}")[0])
     assert list(out.parent.iterdir()) == [out] and out.read_bytes() == b"before"
+
+
+#: Writes the views of a case, of which 100 KiB do not fit below the greatest size of a file.
+WRITES = """
+import pathlib, resource, signal, sys, torch
+from mvrecon.training.export import save_views
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, [int(sys.argv[2])] * 2)
+save_views(pathlib.Path(sys.argv[1]), "case", torch.rand(8, 64, 64), "1/mm * mm")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs limits of POSIX")
+@pytest.mark.parametrize("most", [100, 20_000, 2**20])
+def test_views_that_do_not_fit_on_a_disk_end_with_an_error(most, run_python, tmp_path):
+    """Not with a crash of libhdf5 at the end of the process; also tried: a real disk of 200 KiB."""
+    done = run_python("-c", WRITES, str(tmp_path), str(most))
+    if most == 2**20:
+        assert done.returncode == 0 and (tmp_path / "case" / "views.h5").is_file()
+        return
+    last = done.stderr.strip().splitlines()[-1]
+    assert done.returncode == 1 and "File too large" in last and "views.h5" in last
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
 def test_a_folder_that_is_gone_is_made_again(scan, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.scan_file import NAME, expanded, save
@@ -111,6 +112,24 @@ def test_paths_begin_in_the_folder_of_the_file_and_words_are_no_paths(folder: Pa
         assert expanded([f"scan={folder}"]) == [f"views.path={place}"]
 
 
+def test_paths_from_home_and_numbers_with_an_exponent(folder: Path, monkeypatch):
+    """YAML takes 5e4 for a text, which is a number unless it is the name of a file."""
+    home = folder / "home"
+    home.mkdir()
+    monkeypatch.setenv("HOME", str(home))
+    monkeypatch.setenv("USERPROFILE", str(home))
+    (folder / "1e3").touch()
+    views = {"path": "~/a.h5", "flat": "5e4", "dark": "1e3", "floor": "1e-5"}
+    (folder / NAME).write_text("views: {path: ~/a.h5, flat: 5e4, dark: 1e3, floor: 1e-5}")
+    assert yaml.safe_load((folder / NAME).read_text()) == {"views": views}
+    assert expanded([f"scan={folder}"]) == [
+        f"views.path={home}/a.h5",
+        "views.flat=5e4",
+        f"views.dark={folder}/1e3",
+        "views.floor=1e-5",
+    ]
+
+
 def test_names_of_data_sets_are_no_paths(folder: Path):
     """Written by hand or by `save`, with or without a slash; one of another file begins in the
     folder of the description. Fields and exposures may be files.
@@ -159,6 +178,21 @@ def test_names_of_exposures_are_no_paths(name: str, folder: Path, monkeypatch):
     monkeypatch.chdir(folder)
     save(folder / NAME, {"views": {"exposure": name}})
     assert expanded([f"scan={folder}"]) == expected
+
+
+@pytest.mark.parametrize("pattern", ["scan [0-9]*.tif", "a, (b) = {c}_*", "it's \"*", "view_*.tif"])
+def test_patterns_and_names_of_data_sets_are_kept_with_any_characters(pattern: str, folder: Path):
+    """As `save` writes them and Hydra reads them; what refers or controls terminals is refused."""
+    views = {"pattern": pattern, "dataset": f"/entry/{pattern}"}
+    save(folder / NAME, {"views": views})
+    told = OverridesParser.create().parse_overrides(expanded([f"scan={folder}"]))
+    assert {one.key_or_group: one.value() for one in told} == {
+        f"views.{name}": text for name, text in views.items()
+    }
+    for odd in ("\\x24{every}", "a\\nb", "\\x1b[2J"):
+        (folder / NAME).write_text(f'views: {{pattern: "{odd}"}}')
+        with pytest.raises(Refused, match=r"as views.pattern, got"):
+            expanded([f"scan={folder}"])
 
 
 @pytest.mark.parametrize("typed", ["scan={}", "+scan={}", "scan='{}'", 'scan="{}"'])

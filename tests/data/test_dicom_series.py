@@ -70,6 +70,20 @@ def test_voxel_positions_match_simple_itk(turn, tmp_path):
         assert values[z, y, x].item() == pytest.approx(image.GetPixel((i, j, k)))
 
 
+def test_a_link_to_a_slice_that_was_not_fetched_is_refused(tmp_path):
+    """The last one leaves no gap. Hidden links, as of an editor, are none of the series."""
+    written(tmp_path)
+    (tmp_path / ".#lock").symlink_to("somebody@elsewhere")
+    shape = read_volume(tmp_path)[0].shape
+    last = sorted(tmp_path.glob("[!.]*"))[-1]
+    last.rename(tmp_path.parent / "last")
+    last.symlink_to(tmp_path.parent / "last")
+    assert read_volume(tmp_path)[0].shape == shape
+    (tmp_path.parent / "last").unlink()
+    with pytest.raises(FileNotFoundError, match="is a link to .*, which is not there"):
+        read_volume(tmp_path)
+
+
 def test_slope_and_intercept_are_per_slice(tmp_path):
     values, _ = read_volume(written(tmp_path / "ct"))
     expected = torch.from_numpy(hu()[:, ::-1, ::-1].astype("f4"))  # LPS to RAS: x and y reversed

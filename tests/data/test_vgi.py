@@ -1,10 +1,12 @@
 """VGStudio's volumes."""
 
+import os
+
 import numpy as np
 import pytest
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.volume_files import read_volume
+from mvrecon.data.volume_files import open_volume, read_volume
 
 VALUES = np.arange(24).reshape(2, 3, 4) - 3
 FLOATS = VALUES.astype("<f4")
@@ -30,7 +32,7 @@ def vgi(folder, kind="float", bits=32, unit="mm", values=FLOATS, **changed):
         place, _, key = name.partition(".")
         lines += [f"[{place}]"] * (place != section) + [f"{key} = {value}"]
         section = place
-    (folder / "a.vgi").write_text("\n".join(lines))
+    (folder / "a.vgi").write_text("\n".join(lines), encoding="utf-8")
     values.tofile(folder / "a.vol")
     return folder / "a.vgi"
 
@@ -45,6 +47,21 @@ def test_a_volume_of_vgstudio_has_its_values_and_voxels(kind, bits, dtype, tmp_p
     assert grid.spacing == (0.5, 0.25, 2.0) and np.allclose(grid.centre, 0)
     _, grid = read_volume(vgi(tmp_path, unit="um", geometry__resolution="500 250 2000"))
     assert np.allclose(grid.spacing, (0.5, 0.25, 2.0))
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig"])
+def test_a_unit_of_vgstudio_is_read_in_any_encoding(encoding, tmp_path):
+    path = vgi(tmp_path, unit="µm", geometry__resolution="500 250 2000")
+    path.write_bytes(path.read_text(encoding="utf-8").encode(encoding))
+    assert np.allclose(read_volume(path)[1].spacing, (0.5, 0.25, 2.0))
+
+
+def test_values_that_are_cut_short_while_they_are_read_are_refused(tmp_path):
+    slabs, _ = open_volume(vgi(tmp_path))
+    assert np.array_equal(slabs.whole().numpy(), VALUES)
+    os.truncate(tmp_path / "a.vol", 48)
+    with pytest.raises(Refused, match="a.vol: cannot be read"):
+        slabs.whole()
 
 
 def _ranged(text, **changed):

@@ -8,7 +8,7 @@ import torch
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.attenuation import WATER, attenuation, hounsfield
-from mvrecon.data.volume_files import read_volume, save_volume
+from mvrecon.data.volume_files import read_volume, save_volume, volumes_in
 from mvrecon.data.volumes import Volumes
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
@@ -169,6 +169,22 @@ def test_itk_images_that_are_not_volumes_are_refused(tmp_path):
     path.write_bytes(path.read_bytes().replace(b"DimSize = 4 3 2", b"DimSize = 4000 3 2"))
     with pytest.raises(Refused, match="declares 96000 bytes, where a.mha has"):
         read_volume(path)
+
+
+def test_a_link_to_a_volume_that_was_not_fetched_is_refused(tmp_path):
+    """Without it, cases of a folder would be fewer, and split in another way."""
+    grid = Grid.centred(4, spacing=2.0)
+    for name in "ab":
+        save_volume(tmp_path / f"{name}.nii.gz", torch.zeros(grid.shape), grid)
+    try:
+        (tmp_path / "c.nii.gz").symlink_to("../annex/c")
+    except OSError:
+        pytest.skip("needs symbolic links")
+    with pytest.raises(FileNotFoundError, match=r"c.nii.gz: is a link to .*, which is not there"):
+        volumes_in(tmp_path)
+    (tmp_path / "c.nii.gz").unlink()
+    (tmp_path / "d.nii.gz").symlink_to("a.nii.gz")
+    assert [path.name[0] for path in volumes_in(tmp_path)] == ["a", "b", "d"]
 
 
 def test_a_scene_of_one_file_has_one_case(tmp_path):

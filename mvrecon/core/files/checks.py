@@ -73,7 +73,7 @@ def millimetres(where: object, unit: str) -> float:
 
 
 def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict") -> str:
-    """The UTF-8 text of a file.
+    """The UTF-8 text of a file, without the mark of its encoding that some programs put before it.
 
     Args:
         path: path of the file.
@@ -89,7 +89,7 @@ def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict
     if len(raw) > limit:
         raise Refused(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
     try:
-        return raw.decode("utf-8", errors)
+        return raw.decode("utf-8-sig", errors)
     except UnicodeDecodeError as error:
         raise Refused(f"{path}: is not UTF-8 text ({error})") from error
 
@@ -215,6 +215,19 @@ def file_beside(header: Path, stated: str) -> Path:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected the values of {header.name}")
     return path
+
+
+def check_link(path: Path) -> None:
+    """Check that a path is no link to what is not there, as of a file that was not fetched.
+
+    Raises:
+        FileNotFoundError: it is.
+    """
+    if path.is_symlink() and not path.exists():
+        raise FileNotFoundError(
+            f"{path}: is a link to {path.readlink()}, which is not there; fetch it, or remove "
+            f"the link"
+        )
 
 
 def check_file(path: Path, expected: str) -> None:

@@ -179,7 +179,9 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
     if "Count_cutoff" in entries:
         with unneeded():
             ((top,), _) = numbers("Count_cutoff")
-            head = head._replace(tops=frozenset([top])) if top > 0 else head  # -1: none
+            (of_type,) = head.tops  # which clips counts as well
+            least = min(top, of_type or top)
+            head = head._replace(tops=frozenset([least])) if top > 0 else head  # -1: none
     if "Pixel_size" in entries:
         with unneeded():
             (right, down), unit = numbers("Pixel_size", 2)

@@ -140,7 +140,7 @@ class FrameViews(ProjectionStack):
         scan: see `ProjectionStack`.
         stated: exposure and beam of all frames by name, a text for each, "" if none is stated.
         marked: mask of bad pixels.
-        top: greatest grey value; None: that of the type.
+        top: greatest grey value, if less than that of the type.
     """
 
     def __init__(
@@ -169,7 +169,8 @@ class FrameViews(ProjectionStack):
 
     @property
     def top(self) -> float | None:
-        return super().top if self._top is None else self._top
+        tops = [top for top in (super().top, self._top) if top is not None]
+        return min(tops, default=None)
 
     def _block(self, first: int, last: int) -> np.ndarray:
         return self._frames.read(self._numbers[first:last])

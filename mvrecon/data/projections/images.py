@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors, shown
+from mvrecon.core.files.checks import Refused, check_file, check_link, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import ONE_FILE, DicomImage, dicom_file, same
+from mvrecon.data.dicom_image import DICOM, ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures, rtk_images
 from mvrecon.data.projections.ordering import check_steps, ordered
@@ -266,7 +266,11 @@ def _images(folder: Path, pattern: str | None = None) -> list[Path]:
     with file_errors(folder, f"has no names like {pattern!r}", "expected such as scan_*.tif"):
         inside = sorted(folder.glob(pattern or "*"))
     for file in inside:
-        if file.is_file() and not file.name.startswith(".") and _ending(file):
+        if file.name.startswith("."):
+            continue
+        if file.suffix.lower() in (*ENDINGS, *DICOM):
+            check_link(file)
+        if file.is_file() and _ending(file):
             files.append(file)
         if len(files) > VIEWS:
             raise Refused(f"{folder}: expected at most {VIEWS} images, got more")

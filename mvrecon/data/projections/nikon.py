@@ -31,7 +31,7 @@ class NikonViews(ImageFiles):
         home = path.parent.resolve()
         inside = (home / folder).resolve()
         where = inside if inside.is_relative_to(home) and inside.is_dir() else home
-        super().__init__(view_files(where, f"{escape(name + mark)}[0-9]*.tif*"))
+        super().__init__(view_files(where, f"{escape(name + mark)}[0-9]*.[tT][iI][fF]*"))
         expected = tuple(int(entries.number(f"DetectorPixels{axis}")) for axis in "YX")
         if self.shape != expected:
             raise Refused(

@@ -38,7 +38,7 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
 
     Warns:
         UserWarning: names that differ in more than their numbers; they are sorted as text. Or all
-            numbers are negative.
+            numbers are negative, or decimals that may be several integers have unequal steps.
 
     Raises:
         Refused: two names with the same numbers, a missing number, numbers that may be read in two
@@ -50,7 +50,8 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     where, stems = paths[0].parent, [re.sub(SCIENTIFIC, "x", path.stem.lower()) for path in paths]
     number = INTEGER if _counted(DECIMAL, stems) else f"{DECIMAL}|{INTEGER}"
     mixed_up = any(re.search(SCIENTIFIC, path.stem.lower()) for path in paths)  # 1e-1 and 1e0
-    number = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}{number}"
+    exponents = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}"
+    number = f"{exponents}{number}"
     files, parts, keys = _sorted(paths, number)
     rows = [keys[path][1::2] for path in files]
     alike = len({tuple(part[::2]) for part in parts.values()}) == 1
@@ -101,8 +102,15 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
                 f"{where}: expected one file of every number, got {shown(first.name)} and "
                 f"{shown(second.name)}"
             )
-    if not gaps and all(map(_missing, readings)):
-        check_steps(where, rows)
+    if all(map(_missing, readings)):
+        if not gaps:
+            check_steps(where, rows)
+        if _sorted(paths, f"{exponents}{INTEGER}")[0] != files:  # which no steps contradict
+            warnings.warn(
+                f"{where}: the numbers in the names of the views are taken for decimals: "
+                f"{', '.join(path.name for path in files[:4])}, ...",
+                stacklevel=2,
+            )
     return files
 
 

@@ -9,6 +9,12 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack
 
+#: What a stack states of all views together.
+OF_ALL = (
+    *("kind", "unit", "dose", "own_unit", "duration_s", "total_s", "began", "window_kev"),
+    *("attenuated", "detector", "rig", "mirrored", "scan"),
+)
+
 
 class Sinograms(ProjectionStack):
     """Views [m v u] whose row v is that of the slice v, from sinograms [v m u].
@@ -24,12 +30,15 @@ class Sinograms(ProjectionStack):
         names = [f"row {k}" for k in range(rows)]
         super().__init__(slices.path, names, (slices.n_views, columns), slices.dtype)
         self._slices = slices
-        self.kind, self._top = slices.kind, slices.top
+        self._top = slices.top
         self.fields = {
             name: as_rows(field, self.shape) if isinstance(field, ProjectionStack) else field
             for name, field in slices.fields.items()
         }
-        self.rig, self.mirrored, self.scan = slices.rig, slices.mirrored, slices.scan
+        for name in OF_ALL:
+            setattr(self, name, getattr(slices, name))
+        alike = {name: {*texts} for name, texts in slices.stated.items()}
+        self.stated = {name: [*text] * rows for name, text in alike.items() if len(text) == 1}
         self.excluded = None if slices.excluded is None else 0
 
     @property

@@ -259,7 +259,8 @@ class NpyViews(ProjectionStack):
     def __init__(self, path: Path):
         check_file(path, "a NumPy array [m v u]")
         with file_errors(path, "cannot be read as a NumPy array"):
-            self._array = np.lib.format.open_memmap(path, mode="r")
+            array = np.lib.format.open_memmap(path, mode="r")
+        self._array, self._bytes = array, array.offset + array.nbytes
         if self._array.ndim == 2:
             self._array = self._array[None]
         if self._array.ndim != 3 or max(self._array.shape[1:]) > EDGE:
@@ -268,6 +269,8 @@ class NpyViews(ProjectionStack):
         super().__init__(path, names, self._array.shape[1:], self._array.dtype)
 
     def _block(self, first: int, last: int) -> np.ndarray:
+        if (got := self.path.stat().st_size) < self._bytes:  # reading it would end the process
+            raise Refused(f"{self.path}: expected {self._bytes} bytes, as before, got {got}")
         return self._array[first:last]
 
 

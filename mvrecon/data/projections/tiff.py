@@ -17,6 +17,8 @@ from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
 #: Tags of EXIF on which grey values depend, but not in a proportion that all cameras share.
 EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureBiasValue")
+#: Those of them that are two whole numbers.
+RATIOS = ("FNumber", "ExposureBiasValue")
 #: Tags of TIFF that change the pixels or their order.
 TIFF_KEYS = (
     Key("BitsPerSample", "applied", "also gives the largest grey value"),
@@ -268,7 +270,8 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
     stated = {"ExposureTime": [" or ".join(sorted(times))]}
     for name in EXIF_BEAM:
         if (value := exif.get(name, page.tags.valueof(name))) is not None:
-            stated[name] = [str(value)]
+            ratio = isinstance(value, tuple) and name in RATIOS and value[1] != 0
+            stated[name] = [f"{value[0] / value[1]:g}" if ratio else str(value)]
     head = Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
     manager = page.tags.valueof("MicroManagerMetadata")
     return descriptions.of_page(file, head, page.description, manager)

@@ -120,6 +120,7 @@ def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
         edges: edges of the views' columns, `edges_of(views.mT)`.
     """
     edges, _, _, level, _, noise = edges.split(PARTS, dim=-2)
+    noise = torch.maximum(noise, noise.mean(dim=2, keepdim=True))  # that of a view is a rough one
     top, lowest = level.amax(dim=(2, 3, 4), keepdim=True), edges.amin(dim=(2, 3, 4), keepdim=True)
     air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
     return bool((edges - air > ROW_EDGE * top + ROW_DEVIATIONS * noise).any())

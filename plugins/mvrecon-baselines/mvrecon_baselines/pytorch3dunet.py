@@ -7,12 +7,10 @@ first; the file does not contain the spacing.
 from pathlib import Path
 from typing import NamedTuple
 
-import h5py
 import numpy as np
 
-from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import VOLUME, Refused, check_file
-from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
+from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened, written
 
 EXPECTED = "a file of pytorch-3dunet: HDF5 with raw [z y x] or [c z y x], and optionally label"
 #: Axes of one volume, and of several channels.
@@ -63,7 +61,7 @@ def write_example(path: str | Path, example: Example) -> None:
         Refused: wrong axes, or values and labels of different voxels.
     """
     _checked(path, example)
-    with written_whole(path) as part, h5py.File(part, "w") as file:
+    with written(Path(path)) as file:
         for name, values in example._asdict().items():
             if values is not None:
                 file.create_dataset(name, data=values, compression="gzip", shuffle=True)

@@ -592,6 +592,18 @@ def test_exposure_times_of_tiff_are_applied_by_their_name(tmp_path):
         np.testing.assert_allclose(found, np.broadcast_to(integrals, found.shape), atol=2e-3)
 
 
+@pytest.mark.parametrize(("own", "other", "warned"), [((28, 10), (14, 5), 0), ((4, 1), (28, 5), 1)])
+def test_f_numbers_are_compared_as_ratios(own, other, warned, tmp_path):
+    """As one camera or another states them; also tried: a denominator of 0, which is a text."""
+    for name, ratio in (("view", own), ("flat", other)):
+        tag = [(33437, "2I", 1, ratio, True)]
+        written(tmp_path / f"{name}.tif", np.full((4, 6), 900, "u2"), extratags=tag)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(tmp_path / "view.tif", flat=str(tmp_path / "flat.tif"), find_bad_pixels=False)
+    assert sum("has the FNumber" in str(one.message) for one in caught) == warned
+
+
 @pytest.mark.parametrize(("unit", "factor"), [("s", 1), ("ms", 1e3), (b"us", 1e6), ("min", 1 / 60)])
 def test_times_of_two_files_are_compared_in_one_unit(unit, factor, tmp_path):
     """Of views in s; of currents as well."""

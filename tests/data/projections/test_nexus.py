@@ -651,6 +651,7 @@ SATURATION = {
     "both": ({"saturation_value": 40_000, "bit_depth_readout": 15}, 40_000),
     "never filled": ({"saturation_value": 0, "bit_depth_readout": 0}, 65535),
     "below 0": ({"saturation_value": -1}, 65535),
+    "beyond the type": ({"saturation_value": 1_048_575}, 65535),
     "NaN": ({"saturation_value": np.nan}, 65535),
     "a text": ({"saturation_value": "none"}, 65535),
 }

@@ -40,9 +40,9 @@ def xtekct(folder, **changed):
     return path
 
 
-def images(folder, values):
+def images(folder, values, name="tooth", ending="tif"):
     for k, view in enumerate(values, 1):
-        tifffile.imwrite(folder / f"tooth_{k:04}.tif", view)
+        tifffile.imwrite(folder / f"{name}_{k:04}.{ending}", view)
     return folder
 
 
@@ -106,6 +106,16 @@ def test_the_images_of_nikon_are_found_and_mirrored(folder, tmp_path):
     views = opened(home / "tooth.xtekct", flat=tmp_path / "flat.npy")
     expected = torch.from_numpy(-np.log(mirrored / (mirrored[0] + 40_000))).float()
     assert torch.allclose(views.whole().views, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "ending"), [("tooth", "TIF"), ("Zahnröhre", "tiff"), ("a[1] b", "Tiff")]
+)
+def test_names_of_nikon_have_any_characters_and_case(name, ending, tmp_path):
+    """In the bytes of Latin-1, as Windows stores them in the header; also tried: UTF-8."""
+    values = np.full((3, 4, 6), 30_000, "u2")
+    images(tmp_path, values, name, ending)
+    assert len(opened(xtekct(tmp_path, Name=name)).whole().views) == 3
 
 
 @pytest.mark.parametrize("ends", [("Top",), ("Bottom",), ("",), ("Top", "Bottom", "")])

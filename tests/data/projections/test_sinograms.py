@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.training.export import save_views
 from tests.data.projections.conftest import COLUMNS, FORMS, ROWS, VIEWS, grey, opened
 from tests.data.projections.test_nexus import exchange
+from tests.data.projections.test_tiff import written
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -18,6 +20,33 @@ def test_sinograms_of_slices_are_the_views_of_their_angles(form, tmp_path):
     assert (views.n_views, views.shape) == (VIEWS, (ROWS, COLUMNS))
     assert torch.equal(views.whole().views, torch.from_numpy(grey().astype("f4")))
     assert torch.equal(views.read(3, 7).views, views.whole().views[3:7])
+
+
+def test_what_a_file_states_of_all_views_holds_for_its_sinograms(tmp_path):
+    """Counts keep their unit, dose and duration, and views an exposure that all slices have: their
+    flat field has another. One of each slice is none of a view.
+    """
+    counts = torch.from_numpy(grey().astype("f4")).swapaxes(0, 1)
+    save_views(tmp_path, "a", counts / 10, "spect of activity", True, 10.0, 60.0)
+    stack = opened(tmp_path / "a" / "views.h5", layout="sinogram").stack
+    stated = (stack.kind, stack.unit, stack.dose, stack.duration_s, stack.attenuated)
+    assert stated == ("counts", "spect of activity", 10.0, 60.0, True)
+    assert torch.equal(stack.read(0, VIEWS), counts.swapaxes(0, 1))
+    times = {"alike": [10] * ROWS, "apart": list(range(10, 10 + ROWS))}
+    for name, own in times.items():
+        (tmp_path / name).mkdir()
+        for k, (image, ms) in enumerate(zip(grey().swapaxes(0, 1), own, strict=True)):
+            tag = [(33434, "2I", 1, (ms, 1000), True)]
+            written(tmp_path / name / f"{k}.tif", image, extratags=tag)
+    tag = [(33434, "2I", 1, (20, 1000), True)]
+    written(tmp_path / "flat.tif", np.full((ROWS, COLUMNS), 60_000, "u2"), extratags=tag)
+    options = {"layout": "sinogram", "flat": str(tmp_path / "flat.tif"), "find_bad_pixels": False}
+    with pytest.warns(UserWarning, match="flat field has the ExposureTime 20, its views have 10,"):
+        plain = opened(tmp_path / "alike", **options).whole().views
+    exposed = opened(tmp_path / "alike", exposure="ExposureTime", **options).whole().views
+    assert torch.allclose(exposed, plain - np.log(2), atol=1e-5)
+    with pytest.warns(UserWarning, match="several values of ExposureTime"):
+        assert opened(tmp_path / "apart", **options).stack.exposure("ExposureTime") is None
 
 
 def test_fields_of_sinograms_are_views_or_sinograms(tmp_path):

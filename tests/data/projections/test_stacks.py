@@ -1,5 +1,6 @@
 """Whatever form a scan has on disk, its views are the same numbers in the same order."""
 
+import os
 import struct
 import warnings
 import zlib
@@ -17,7 +18,7 @@ from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.ordering import ordered
 from mvrecon.data.projections.png import INTERLACED, PLAIN
 from mvrecon.data.volume_files import read_volume
-from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey
+from tests.data.projections.conftest import FORMS, VIEWS, dicom_image, grey, images
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -213,6 +214,53 @@ def test_a_view_missing_among_decimals_or_pairs_of_numbers_is_reported(names, tm
     with pytest.raises(Refused, match="is a file missing"):
         ordered(paths)
     assert sorted(ordered(paths, gaps=True)) == sorted(paths)
+
+
+@pytest.mark.parametrize(
+    ("names", "warned"),
+    [
+        (["s1.11", "s1.8", "s1.9"], True),
+        (["s1.1", "s1.11", "s1.13", "s1.3"], True),
+        (["a_0.25", "a_0.5", "a_1.75"], True),
+        (["a_0.25", "a_0.5", "a_0.75", "a_1.0"], False),
+        (["a_2.36", "a_6.19", "a_11.02"], False),
+        (["a_1", "a_3", "a_11"], False),
+    ],
+)
+def test_decimals_that_may_be_two_numbers_are_named_where_no_steps_tell_them(
+    names, warned, tmp_path
+):
+    """With gaps that are allowed; s1.11 may be the image 11 of the scan 1."""
+    paths = [tmp_path / f"{name}.tif" for name in names]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert ordered(paths[::-1], gaps=True) == paths
+    assert ["taken for decimals" in str(one.message) for one in caught] == [True] * warned
+
+
+@pytest.mark.parametrize("name", ["view_4.tif", "view_4.TIFF", "4.png", "4.dcm", "4.his"])
+def test_a_link_to_a_view_that_was_not_fetched_is_refused(name, tmp_path):
+    """As in repositories of large files: without the last view, all others have other angles."""
+    folder = images(tmp_path / "scan", grey()[:4])
+    try:
+        (folder / name).symlink_to("../.git/annex/objects/a")
+    except OSError:
+        pytest.skip("needs symbolic links")
+    with pytest.raises(FileNotFoundError, match=f"{name}: is a link to .*, which is not there"):
+        open_projections(folder)
+    (folder / name).rename(folder / "notes.txt")
+    (folder / "._view_9.tif").symlink_to("elsewhere.tif")
+    assert open_projections(folder).n_views == 4
+
+
+def test_an_array_that_is_cut_short_while_it_is_read_is_refused(tmp_path):
+    """Reading it would end the process; also tried: arrays in the order of Fortran, one view."""
+    np.save(tmp_path / "a.npy", np.ones((4, 64, 64), "f4"))
+    stack = open_projections(tmp_path / "a.npy")
+    assert stack.read(3, 4).eq(1).all()
+    os.truncate(tmp_path / "a.npy", 1000)
+    with pytest.raises(Refused, match=r"a.npy: expected \d+ bytes, as before, got 1000"):
+        stack.read(3, 4)
 
 
 def test_an_index_beside_another_number_shows_that_no_view_is_missing(tmp_path):

@@ -370,9 +370,14 @@ def test_entries_of_dectris_that_cannot_be_read_are_warned_of(name, text, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("text", "top"), [("-1", 2**31 - 1), ("0 counts", 2**31 - 1), ("1,048,574 counts", 1048574)]
+    ("text", "top"),
+    [
+        *(("-1", 2**31 - 1), ("0 counts", 2**31 - 1), ("1,048,574 counts", 1048574)),
+        ("4294967295 counts", 2**31 - 1),
+    ],
 )
 def test_cutoffs_of_dectris_with_commas_or_of_none_are_read(text, top, tmp_path):
+    """Those beyond the pixels' type, in which counts are clipped, are its greatest value."""
     pilatus(tmp_path / "a.tif", exposed()[0], Count_cutoff=text)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

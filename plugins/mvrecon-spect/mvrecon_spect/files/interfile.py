@@ -122,7 +122,7 @@ def read_header(path: str | Path, content: Content) -> Header:
     path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected an Interfile header")
-    text = text_of(path, errors="surrogateescape").removeprefix("\ufeff")  # names of patients
+    text = text_of(path, errors="surrogateescape")  # names of patients
     text = re.sub(r"\\\r?\n", "", text)
     lines = [line.partition(";")[0].strip() for line in text.splitlines()]
     pairs = [(_name(key), value) for key, mark, value in (x.partition(":=") for x in lines) if mark]

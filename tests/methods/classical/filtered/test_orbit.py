@@ -206,6 +206,25 @@ def test_a_part_beyond_the_rows_of_some_views_is_named_beside_a_body_within_them
         assert any("above or below the rows" in str(one.message) for one in caught) == beyond
 
 
+@pytest.mark.parametrize("photons", [30.0, 100.0, 1000.0])
+@pytest.mark.parametrize("beyond", [False, True])
+def test_noise_of_few_photons_is_no_part_beyond_the_rows(photons, beyond):
+    """In none of four series of random numbers; a body that is so high is named in all."""
+    rig = circular(60, 200.0, 300.0, {"pixels": [24, 48], "pixel_mm": 1.6})
+    size, at, turn = torch.full((1, 3), 6.0), torch.tensor([[3.0, -2.0, 0.0]]), torch.eye(3)[None]
+    if beyond:
+        size[0, 2] = 60.0
+    body = Solids("ellipsoid", at, turn, size, torch.tensor([VALUE]))
+    light = photons * (-views_of(Phantom((body,)), rig)).exp()
+    grid = Grid.centred(size=(24, 24, 40), spacing=2.0)
+    for seed in range(4):
+        counts = torch.poisson(light, torch.Generator().manual_seed(seed)).clamp(min=0.5)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            fdk(Drr(grid, rig), -(counts / photons).log())
+        assert any("above or below the rows" in str(one.message) for one in caught) == beyond
+
+
 @pytest.mark.parametrize("kind", ["fan", "parallel"])
 def test_rolled_detectors_keep_a_cylinder_and_magnify_a_ball_and_this_is_said(kind: str):
     """Rows at 12 degrees against the plane of the sources, for cone and parallel beams alike."""
