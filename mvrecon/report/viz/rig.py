@@ -162,7 +162,7 @@ class Mesh(NamedTuple):
     """Triangles.
 
     Args:
-        vertices: world mm.
+        vertices: corners in world mm.
         colours: colour of each vertex: red, green and blue up to 255.
         faces: indices of three vertices each.
     """
