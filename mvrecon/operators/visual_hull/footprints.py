@@ -77,8 +77,9 @@ def footprints(
             joseph and trilinear (a voxel from its centre), 0 for siddon.
         gaps: number of gaps between rays; from 1 on, footprints grow for bodies between rays, by
             half a pixel and half of so many diagonals of one, as all rays of a brick's own
-            footprint may miss a body's part in it. With 1, a ray of the grown footprint meets every ball as wide as a pixel's diagonal
-            magnified to there (`ray_gap`); larger values meet more of thinner bodies.
+            footprint may miss a body's part in it. With 1, a ray of the grown footprint meets every
+            ball as wide as a pixel's diagonal magnified to there (`ray_gap`); larger values meet
+            more of thinner bodies.
     """
     return footprints_of(prints_of(cameras, grid, gaps), cameras.shape, grid.shape, bricks, reach)
 
