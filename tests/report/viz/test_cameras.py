@@ -35,4 +35,4 @@ def test_dots_mark_shifts_and_rings_the_truth():
 def test_many_cameras_are_arranged_in_rows_with_large_shifts_inside_the_picture():
     image = alignments(torch.full((10, 2), 99.0), torch.ones(10))
     assert image.shape == (4 * LEGEND_LINE + 3 * TILE_EDGE, 4 * TILE_EDGE, 3)
-    assert (image[LEGEND_LINE + TILE_EDGE - 1, TILE_EDGE - 1] == WHITE).all()
+    assert (image[2 * LEGEND_LINE + TILE_EDGE - 1, TILE_EDGE - 1] == WHITE).all()
