@@ -72,8 +72,9 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
         figure = Figure((width / 100, width / 100), dpi=100)
         canvas = FigureCanvasAgg(figure)
         for (row, column), (right, up), title in PANELS:
-            place = PANEL_EDGE * column + PANEL_LEFT, PANEL_EDGE * (1 - row) + PANEL_BELOW
-            axes = figure.add_axes([part / width for part in (*place, PANEL_AXES, PANEL_AXES)])
+            left, below = PANEL_EDGE * column + PANEL_LEFT, PANEL_EDGE * (1 - row) + PANEL_BELOW
+            share = PANEL_AXES / width
+            axes = figure.add_axes((left / width, below / width, share, share))
             for line in (axes.axhline, axes.axvline):
                 line(0, color=RAY_COLOUR, linewidth=0.8)
             views = zip(chosen, starts[..., [right, up]], corners[..., [right, up]], strict=True)
