@@ -111,7 +111,9 @@ def main(scan: Path, volumes: Path, folder: Path) -> None:
         table.writerow(["difference", "relative L2", "relative L2 in the body", "slope"])
         table.writerows(rows)
     shown.pop("fdk_floor", None)
-    picture = coronal({"fdk": shown.pop("fdk"), "RTK's fdk": peer, **shown}, truth, grid)
+    named = {"FDK": shown.pop("fdk"), "RTK's FDK": peer}
+    named |= {name.upper().replace("_", "-"): x for name, x in shown.items()}
+    picture = coronal(named, truth, grid)
     # with a palette the file is a third as large
     Image.fromarray(picture).quantize(method=Image.Quantize.MAXCOVERAGE).save(folder / "planes.png")
 

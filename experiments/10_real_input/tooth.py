@@ -29,13 +29,14 @@ def read(scan: Path, folder: Path) -> None:
 
 def draw(right: Path, wrong: Path, out: Path) -> None:
     """The first plane of both volumes, white at the 99.9th percentile of the correct one."""
-    volumes = {name: mv.read_volume(name)[0] for name in (right, wrong)}
-    top = np.percentile(volumes[right], 99.9)
+    named = {"correct offset of the axis": right, "wrong sign of the offset": wrong}
+    volumes = {name: mv.read_volume(file)[0] for name, file in named.items()}
+    top = np.percentile(volumes["correct offset of the axis"], 99.9)
     figure = Figure(figsize=(7.5, 3.4), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     for axis, (name, volume) in zip(axes, volumes.items(), strict=True):
         shown = axis.imshow(volume[0], cmap="gray", vmin=0, vmax=top)
-        axis.set(title=f"offset of {name.name.removesuffix('.nii.gz')} pixels", xlabel="x / pixels")
+        axis.set(title=name, xlabel="x / pixels")
     axes[0].set_ylabel("y / pixels")
     figure.colorbar(shown, ax=axes, label="attenuation (1/pixel)")
     figure.savefig(out, dpi=100)

@@ -39,6 +39,14 @@ METHODS = {
     "bsrem 0.03": (15, lambda A, y, n, **o: bsrem(A, y, n, 0.03, 8, **o)),
     "tv_map 0.1": (100, lambda A, y, n, **o: tv_map(A, y, n, 0.1, background=0.01, **o)),
 }
+#: Names in the picture.
+TOLD = {
+    "mlem": "MLEM",
+    "osem20": "OSEM, 20 subsets",
+    "bsrem 0.003": "BSREM, weight 0.003",
+    "bsrem 0.03": "BSREM, weight 0.03",
+    "tv_map 0.1": "total variation, weight 0.1",
+}
 
 
 def ring(radius: float, count: int, z: float = 0.0, start: float = 0.0) -> torch.Tensor:
@@ -143,12 +151,12 @@ def draw(rows: list[dict], file: Path) -> None:
         for axis, diameter in zip(axes, (13.0, 22.0), strict=False):
             points = [r for r in lines if r["sphere_mm"] == diameter]
             pairs = [(float(r["variability"]), float(r["recovery"])) for r in points]
-            axis.plot(*zip(*pairs, strict=True), ".-", label=name)
+            axis.plot(*zip(*pairs, strict=True), ".-", label=TOLD[name])
             axis.set(xlabel="background variability", ylabel="contrast recovery")
             axis.set_title(f"contrast and noise, sphere of {diameter:g} mm")
             if axis is axes[0]:
                 seconds = [float(r["seconds"]) for r in points]
-                axes[2].plot(seconds, [recovery for _, recovery in pairs], ".-", label=name)
+                axes[2].plot(seconds, [recovery for _, recovery in pairs], ".-", label=TOLD[name])
     axes[2].set(xlabel="processor time (s)", ylabel="contrast recovery", xscale="log")
     axes[2].set_title("contrast and time, sphere of 13 mm")
     axes[2].legend()

@@ -86,7 +86,8 @@ def measure(out: Path) -> None:
             for label, (method, options, known) in METHODS.items():
                 x = method(operators[known], counts, **options)[0, 0] / scale
                 if draw == 0:
-                    title = f"{label},\n{total:.0e} counts".replace(", ", "\n")
+                    named = label.replace("osem", "OSEM").replace("bsrem", "BSREM")
+                    title = f"{named},\n{total:.0e} counts".replace(", ", "\n")
                     of_total[title] = polar_map(x, GRID, case.axis, 45.0)
                 names = {"counts": f"{total:.0e}", "draw": draw, "method": label}
                 rows.append(names | figures(x, case))

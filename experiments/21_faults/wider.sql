@@ -1,9 +1,9 @@
 with few as (
-  select 'not aligned' as views, seed, steps, [case], psnr from [experiments/21_faults/ablations.csv] where method = 'none'
+  select 'misaligned' as views, seed, steps, [case], psnr from [experiments/21_faults/ablations.csv] where method = 'none'
   union all
-  select 'not aligned', seed, steps, [case], psnr from [experiments/21_faults/wider.csv] where method = 'default'
+  select 'misaligned', seed, steps, [case], psnr from [experiments/21_faults/wider.csv] where method = 'default'
   union all
-  select 'not aligned, reweight=12', seed, steps, [case], psnr from [experiments/21_faults/unaligned.csv]
+  select 'misaligned, reweight=12', seed, steps, [case], psnr from [experiments/21_faults/unaligned.csv]
   where method = 'cross_view, reweight=12'
   union all
   select 'aligned', seed, steps, [case], psnr from [experiments/21_faults/cases.csv] where method = 'cross_view'
@@ -11,11 +11,11 @@ with few as (
   select 'counts of 16 pinholes', seed, steps, [case], psnr from [experiments/22_dcspect/cases.csv]
   where method = 'cross_view' and faults = 'all'
 ), more as (
-  select 'not aligned' as views, '[16,32]' as widths, seed, steps, [case], psnr from [experiments/21_faults/ablations.csv]
+  select 'misaligned' as views, '[16,32]' as widths, seed, steps, [case], psnr from [experiments/21_faults/ablations.csv]
   where method = 'weight_widths=[16,32]'
   union all
   select case when faults like 'views 4%' then 'counts of 16 pinholes' when faults like '%lost%' then 'aligned'
-    when method = 'weights_16_32' then 'not aligned' else 'not aligned, reweight=12' end,
+    when method = 'weights_16_32' then 'misaligned' else 'misaligned, reweight=12' end,
     iif(method like '%[32,64]', '[32,64]', '[16,32]'), seed, steps, [case], psnr
   from [experiments/21_faults/wider.csv] where method != 'default'
 )

@@ -25,6 +25,13 @@ from mvrecon.geometry.cameras.field import auto_grid
 FLAT, PITCH, AXIS = 46811, 0.05, 6.05
 #: Cylinders of the simulated scan: centre (x, y) and radius in pixels, attenuation of a pixel.
 CYLINDERS = [(10, -8, 90, 0.008), (40, 25, 15, 0.02), (-50, 10, 3, 0.1), (0, -60, 6, 0.05)]
+#: Titles of panels by the correction.
+SHOWN = {
+    "as_is": "as measured",
+    "found": "bad columns interpolated",
+    "gains": "rings=gains",
+    "sorting": "rings=sorting",
+}
 
 
 def fbp(sinogram, degrees, axis, size, pitch):
@@ -116,7 +123,7 @@ def neutron(file, out):
             "rings",
         )
         csv.writer(lines).writerows([head, *rows])
-    draw("neutron.png", {name.replace("_", " "): x for name, x in slices.items()}, -0.1, 0.8)
+    draw("neutron.png", {SHOWN[name]: x for name, x in slices.items()}, -0.1, 0.8)
 
 
 def rings(values):
@@ -198,16 +205,19 @@ def simulated():
     with (Path(__file__).parent / "rings.csv").open("w", newline="") as lines:
         csv.writer(lines).writerows([("pixels", "rings", "rms error", "rings left"), *rows])
     shown = [slices["unequal", name] for name in ("none", "gains", "sorting")]
-    draw("rings.png", dict(zip(("as measured", "gains", "sorting"), shown, strict=True)), 0, 0.04)
+    names = ("as measured", SHOWN["gains"], SHOWN["sorting"])
+    draw("rings.png", dict(zip(names, shown, strict=True)), 0, 0.04, "attenuation (1/pixel)")
 
 
-def draw(name, slices, low, high):
-    """Slices beside each other."""
-    figure, panels = plt.subplots(1, len(slices), figsize=(3 * len(slices), 3.3), dpi=100)
+def draw(name, slices, low, high, quantity="attenuation (1/mm)"):
+    """Slices beside each other, in pixels, on one scale."""
+    shape = {"figsize": (2.7 * len(slices) + 0.8, 3.1), "layout": "constrained", "sharey": True}
+    figure, panels = plt.subplots(1, len(slices), dpi=100, **shape)
     for panel, (title, values) in zip(panels, slices.items(), strict=True):
-        panel.imshow(values, cmap="gray", vmin=low, vmax=high)
-        panel.set(title=title, xticks=[], yticks=[])
-    figure.tight_layout()
+        shown = panel.imshow(values, cmap="gray", vmin=low, vmax=high)
+        panel.set(title=title, xlabel="x (pixels)")
+    panels[0].set_ylabel("y (pixels)")
+    figure.colorbar(shown, ax=panels, label=quantity, shrink=0.8)
     figure.savefig(Path(__file__).with_name(name))
 
 

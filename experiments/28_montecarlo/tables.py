@@ -43,8 +43,9 @@ def draw(volumes: dict[tuple, torch.Tensor], file: Path) -> None:
     places = dict(zip(PANELS, axes.flat, strict=True))
     for key, image in flat.items():
         version, method, operator = key
+        named = method.upper() + " before footprints" * (version != "")
         shown = places[key].imshow(image, cmap="inferno", vmin=0, vmax=top, origin="lower")
-        places[key].set_title(f"{method} {version}\n{operator}", fontsize=7)
+        places[key].set_title(f"{named}\n{operator}", fontsize=7)
     figure.colorbar(shown, ax=axes, label="counts / mm$^2$, summed along the rods", fraction=0.03)
     figure.savefig(file, dpi=100)
 

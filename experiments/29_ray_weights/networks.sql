@@ -6,7 +6,7 @@ with rows as (
   select method || ', study 21', faults, seed, [case], psnr, psnr_inside, ssim, steps from [experiments/21_faults/unaligned.csv] where seed = 0 and steps between 1000 and 1100
 ),
 named as (
-  select *, case when faults = 'none' then 'clean' when faults like '%rod%' then 'inconsistent' else 'rig errors' end as views from rows
+  select *, case when faults = 'none' then 'clean' when faults like '%rod%' then 'corrupted pixels' else 'misaligned' end as views from rows
 ),
 patients as (  -- means over the seeds; differences between networks of the same seed
   select a.views, a.method, a.[case], a.steps, avg(a.psnr) as psnr, avg(a.psnr_inside) as psnr_inside, avg(a.ssim) as ssim, avg(n.psnr - a.psnr) as difference

@@ -45,7 +45,7 @@ def compare(
         places: run folders, or folders with runs in them.
         reference: label of the method that the others are compared with; None: the first.
         metric: figure of merit whose paired differences are shown, one of `COMPARED_FIGURES`.
-        out: folder.
+        out: folder of the tables.
 
     Raises:
         FileNotFoundError: a place without a finished run.

@@ -143,7 +143,7 @@ def reconstruct(
     Args:
         scan: the views as measured.
         method: the method that reconstructs them.
-        output: files.
+        output: files to write.
         corrections: those made before the reconstruction.
         settings: settings of the run; `left_out`: also predict each view from all others, by one
             more reconstruction each.
@@ -189,7 +189,8 @@ def reconstruct(
     if fit is not None:  # files of an earlier run stay until this one has its volume
         fit |= save_calibration(nominal, fitted, free, settings.grid, output)
     volume = output.in_unit(outcome.volume)
-    sheets = review.CaseSheets(output.volume.name, scan.grid, 1.0, output.unit)
+    title = f"{output.volume.name}: {method.name}, {len(scan.cameras)} views"
+    sheets = review.CaseSheets(title, scan.grid, 1.0, output.unit)
     picture = review.scan(sheets.about(volume, scan.cameras), volume)
     images.save_png(folder / "planes.png", picture)
     bar.phase("checking")
@@ -235,9 +236,9 @@ def save_calibration(
     Args:
         nominal: the scan before the calibration.
         fitted: its cameras after it.
-        free: what was fitted.
+        free: parameters that were fitted.
         grid: its settings.
-        output: files.
+        output: files to write.
 
     Raises:
         ValueError: views in memory.

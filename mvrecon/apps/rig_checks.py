@@ -237,10 +237,10 @@ class SomeViews(NamedTuple):
         iterations: int = SEARCH_ITERATIONS,
         order: tuple[bool, tuple[int, ...]] = STORED_ORDER,
     ) -> Float[Tensor, " m"]:
-        """Of each view's residual by a hypothesis, relative to those of all views.
+        """The square of each view's residual by a hypothesis, relative to those of all views.
 
         Raises:
-            ValueError: of a projector that refuses the cameras.
+            ValueError: the projector refuses the cameras.
         """
         exchanged, reversed_axes = order
         y, mask = (x.mT if exchanged else x for x in (self.views, self.mask))

@@ -86,7 +86,7 @@ class Method:
 
     Args:
         name: its name.
-        module: f(views, A).
+        module: method f(views, A).
         stop_sigma: standard deviation of the line integrals' noise: an iterative method stops
             where it explains the residual; None: no such rule.
         choose: chooses iterations and weight on left-out views; None: no choice.
@@ -188,9 +188,9 @@ class _RunMonitor:
 
 
 def emission(scan: Scan, volume: Float[Tensor, "d h w"], device: str = "cpu") -> dict[str, float]:
-    """Of counts: the system's sensitivity in counts per s and MBq at the centre of the grid, for
-    all views at once and one photon a decay, attenuated as by the projector, and without factors;
-    of a volume in kBq/ml its total in MBq. Empty for line integrals.
+    """The sensitivity of a system that counts, in counts per s and MBq at the centre of the grid,
+    for all views at once and one photon per decay, attenuated as by the projector, and without
+    factors; and the total in MBq of a volume in kBq/ml. Empty for line integrals.
 
     Joint scans, whose photons per decay differ, have no sensitivity.
     """

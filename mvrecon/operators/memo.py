@@ -57,7 +57,7 @@ def kept(of: Any, key: Hashable, make: Callable[[], Value]) -> Value:
             freed.
         key: what distinguishes the value among those of the object, with all else that determines
             it.
-        make: computes the value.
+        make: function that computes the value.
     """
     if torch.compiler.is_compiling():
         known = _results.get(of, {}).get(key) if torch.compiler.is_exporting() else None

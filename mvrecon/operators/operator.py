@@ -84,7 +84,7 @@ def check_finite(views: Float[Tensor, "b c m v u"], on_gpu: bool = True) -> None
     (`torch.export`), which cannot raise by values.
 
     Args:
-        views: measured.
+        views: measured views.
         on_gpu: also check views on a GPU, which synchronises. False is for callers whose results
             are then not finite either.
 

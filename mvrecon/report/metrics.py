@@ -255,7 +255,7 @@ def case_metrics(
     for a failed volume, with NaN or infinity.
 
     Args:
-        volume: reconstructed.
+        volume: reconstructed volume.
         views: projections of that volume.
         case: a batch of one, with the true "volume", "inside" and the measured "views".
         data_range: range of the true values, for PSNR and SSIM.

@@ -51,7 +51,7 @@ class TrainingState(TypedDict, total=False, extra_items=Any):
         state_dict, current_model_state: weights; of averages those that are trained on.
         hyper_parameters: arguments of `ReconstructionModule`.
         callbacks: states by name.
-        loops: progress.
+        loops: progress of the loops.
         gradients: gradients of every process, in an accumulation that is not finished.
     """
 

@@ -73,7 +73,7 @@ def evaluate(
 
     Raises:
         TypeError, ValueError: a data range that is not a positive and finite number.
-        Exception: of a method on the first scene.
+        Exception: what a method raises on the first scene.
     """
     data_range = data_range_of(data_range)
     A, others = A.to(device), {k: B.to(device) for k, B in (assumed or {}).items()}

@@ -62,7 +62,7 @@ class TrainerOptions(TypedDict, total=False):
     Args:
         callbacks: those of the setting callbacks.
         logger: those of the setting logger.
-        plugins: mvrecon's own.
+        plugins: mvrecon's own plugins of Lightning.
         default_root_dir: the folder of the run.
         use_distributed_sampler: never, as the cases are shared among the processes already.
     """

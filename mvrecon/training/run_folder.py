@@ -41,7 +41,7 @@ def run_lock(
 
     Args:
         folder: folder of the run.
-        settings: plain.
+        settings: plain settings.
         file: name of the settings' file.
         products: files that a failing run removes, if they are new.
 

@@ -142,7 +142,7 @@ class Trained:
         """Reconstruct views of an operator, without gradient.
 
         Args:
-            views: measured.
+            views: measured views.
             A: the operator.
             name: name of the method, for warnings.
             fallback: for a network that was trained on many rigs, return the classical start where

@@ -97,7 +97,7 @@ def bars(axis: Axes, values: Tensor, wrong: Tensor, name: str) -> None:
     """A bar for each camera, red where it is faulty."""
     colours = ["tab:red" if bad else "tab:gray" for bad in wrong.tolist()]
     axis.bar(range(len(values)), values.tolist(), color=colours)
-    axis.set(xlabel="camera (red: wrong)", ylabel=name, xticks=range(len(values)))
+    axis.set(xlabel="camera (red: misaligned)", ylabel=name, xticks=range(len(values)))
 
 
 def by_method(case: Batch, A: mv.Drr, network: Trained) -> dict[str, Tensor]:

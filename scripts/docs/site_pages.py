@@ -40,7 +40,7 @@ here by four methods.*
   [registration](docs/tutorials/register.md).
 
 First [install](docs/install.md), then take ten minutes for
-[three short walks](docs/start.md). Reference: [all names of `mv`](reference/mv.md),
+[three quick starts](docs/start.md). Reference: [all names of `mv`](reference/mv.md),
 [all pages](docs/README.md).
 """
 #: Lines of code are at most 100 characters wide, and so is their column; longer commands wrap.

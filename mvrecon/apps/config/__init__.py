@@ -97,7 +97,7 @@ def launch(task: Callable[[DictConfig], Any], app: str, record: type | None = No
     also lie in the current folder.
 
     Args:
-        task: f(config).
+        task: function f(config) to run.
         app: name of its file of choices.
         record: a dataclass of all its settings; None: that of mvrecon's own app.
 
@@ -302,7 +302,7 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
     """Make every path in plain settings absolute, so that they are valid from any folder.
 
     Args:
-        settings: whose plugins are imported.
+        settings: settings whose plugins are imported.
         record: the type of the app's settings.
     """
 

@@ -50,7 +50,7 @@ def one_line(app: str) -> Iterator[None]:
     line.
 
     Args:
-        app: begins the line.
+        app: name of the app, with which the line begins.
 
     Raises:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.

@@ -238,8 +238,8 @@ def run_once(task: Callable[[DictConfig], Any], config: DictConfig, app: str, co
 
     Args:
         task: whose errors pass through Hydra.
-        config: composed and checked.
-        app: names the log file.
+        config: composed and checked config.
+        app: name of the app and of its log file.
         conf: folder of mvrecon's configs.
     """
     callbacks: Any = Callback()

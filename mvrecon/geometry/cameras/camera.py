@@ -329,7 +329,7 @@ class Cameras:
 
         Args:
             rotation: R, one for all cameras or one for each.
-            translation: t in mm, likewise.
+            translation: shift t in mm, likewise.
 
         Raises:
             TypeError: not tensors of real numbers.

@@ -35,10 +35,10 @@ class Coverage(NamedTuple):
     """Shares of a grid's voxels or of bodies' mass, from 0 to 1, that a rig sees.
 
     Args:
-        every: seen by every view.
-        half: seen by at least half of the views.
-        none: seen by no view.
-        poor: seen by less than `MIN_SEEN_SHARE` of the views that see the best seen point.
+        every: share of the grid that every view sees.
+        half: share that at least half of the views see.
+        none: share that no view sees.
+        poor: share seen by less than `MIN_SEEN_SHARE` of the views that see the best seen point.
     """
 
     every: float
@@ -251,7 +251,7 @@ def check_coverage(
     Args:
         cameras: the rig.
         grid: the voxels.
-        remedy: ends the warning.
+        remedy: advice that ends the warning.
         bodies: true volumes of the first cases.
 
     Warns:

@@ -75,10 +75,11 @@ def footprints(
         bricks: N of them; all cameras' corners are held at once, 500 bytes per brick and camera.
         reach: voxels by which interpolation extends a value beyond the faces of its voxel: 0.5 for
             joseph and trilinear (a voxel from its centre), 0 for siddon.
-        gaps: from 1 on, grow footprints for bodies between rays: by half a pixel and half of so
-            many diagonals of one, as all rays of a brick's own footprint may miss a body's part in
-            it. With 1, a ray of the grown footprint meets every ball as wide as a pixel's diagonal
-            magnified to there (`ray_gap`); larger values meet more of thinner bodies.
+        gaps: number of gaps between rays; from 1 on, footprints grow for bodies between rays, by
+            half a pixel and half of so many diagonals of one, as all rays of a brick's own
+            footprint may miss a body's part in it. With 1, a ray of the grown footprint meets every
+            ball as wide as a pixel's diagonal magnified to there (`ray_gap`); larger values meet
+            more of thinner bodies.
     """
     return footprints_of(prints_of(cameras, grid, gaps), cameras.shape, grid.shape, bricks, reach)
 

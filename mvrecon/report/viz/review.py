@@ -509,7 +509,7 @@ def _names(panels: Sequence[Panel | None]) -> list[str]:
 
 
 def _chosen(count: int, most: int = MAX_CAMERAS) -> list[int]:
-    """At most so many cameras, at equal steps."""
+    """The numbers of at most so many cameras, at equal steps."""
     shown = min(count, most)
     return [k * count // shown for k in range(shown)]
 
@@ -563,8 +563,8 @@ def alignments(
     edge. At most four tiles a row.
 
     Args:
-        shift_px: estimated, along columns (to the right) and rows (downwards).
-        gain: estimated.
+        shift_px: estimated shifts, along columns (to the right) and rows (downwards).
+        gain: estimated gains.
         true_shift_px: true shifts, along columns and rows, in pixels; None: unknown.
     """
     truths = [None] * len(gain) if true_shift_px is None else true_shift_px.tolist()
@@ -601,14 +601,13 @@ def _alignment_tile(name: str, shift: list[float], truth: list[float] | None) ->
 
     tile = Pillow.new("RGB", (TILE_EDGE, TILE_EDGE))
     draw, middle = ImageDraw.Draw(tile), TILE_EDGE // 2
-    draw.text((1, 1), name, fill=LIGHT, font_size=15)
     draw.line((0, middle, TILE_EDGE, middle), fill=GREY)
     draw.line((middle, 0, middle, TILE_EDGE), fill=GREY)
     draw.circle((middle, middle), PIXEL_EDGE, outline=GREY)
     if truth is not None:
         draw.circle(_in_tile(truth), 2 * DOT_RADIUS, outline=GREEN)
     draw.circle(_in_tile(shift), DOT_RADIUS, fill=(255, 255, 255))
-    return np.asarray(tile)
+    return np.vstack([_legend([name], TILE_EDGE), np.asarray(tile)])
 
 
 def _in_tile(shift: list[float]) -> tuple[float, float]:

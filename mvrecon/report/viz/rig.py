@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 
-#: Pixels of `picture`: a panel's edge and its margin.
-PANEL_EDGE, PANEL_MARGIN = 440, 80
+#: Pixels of `picture`: a panel's edge, its margins on the left and below, and the edge of its axes.
+PANEL_EDGE, PANEL_LEFT, PANEL_BELOW, PANEL_AXES = 440, 84, 58, 332
 #: Approximate number of views in `picture` and as lines; width of the mesh's lines relative to the
 #: scene.
 DRAWN_VIEWS, DRAWN_LINES, LINE_WIDTH = 24, 40, 0.003
@@ -67,13 +67,14 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     low, high = points.aminmax(dim=0)
     centre = ((low + high) / 2).tolist()
     reach = 1.05 * max((high - low).max().item() / 2, 1e-9)
-    width, inner = 2 * PANEL_EDGE, PANEL_EDGE - 2 * PANEL_MARGIN
+    width = 2 * PANEL_EDGE
     with rc_context({"font.size": 11, "axes.titlesize": "medium"}):
         figure = Figure((width / 100, width / 100), dpi=100)
         canvas = FigureCanvasAgg(figure)
         for (row, column), (right, up), title in PANELS:
-            left, below = PANEL_EDGE * column + PANEL_MARGIN, PANEL_EDGE * (1 - row) + PANEL_MARGIN
-            axes = figure.add_axes((left / width, below / width, inner / width, inner / width))
+            left, below = PANEL_EDGE * column + PANEL_LEFT, PANEL_EDGE * (1 - row) + PANEL_BELOW
+            share = PANEL_AXES / width
+            axes = figure.add_axes((left / width, below / width, share, share))
             for line in (axes.axhline, axes.axvline):
                 line(0, color=RAY_COLOUR, linewidth=0.8)
             views = zip(chosen, starts[..., [right, up]], corners[..., [right, up]], strict=True)
@@ -162,7 +163,7 @@ class Mesh(NamedTuple):
     """Triangles.
 
     Args:
-        vertices: world mm.
+        vertices: corners in world mm.
         colours: colour of each vertex: red, green and blue up to 255.
         faces: indices of three vertices each.
     """

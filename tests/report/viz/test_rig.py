@@ -9,7 +9,10 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.report.viz.rig import (
     BOX_COLOUR,
     FIRST_COLOUR,
+    PANEL_AXES,
+    PANEL_BELOW,
     PANEL_EDGE,
+    PANEL_LEFT,
     U_COLOUR,
     V_COLOUR,
     picture,
@@ -26,9 +29,10 @@ def of_colour(image: np.ndarray, colour: str) -> np.ndarray:
 
 
 def middle(image: np.ndarray, colour: str) -> np.ndarray:
-    """The mean column and row of a colour, from the panel's middle, rows upwards."""
+    """The mean column and row of a colour, from the middle of the panel's axes, rows upwards."""
     rows, columns = np.nonzero(of_colour(image, colour))
-    return np.array([columns.mean() - PANEL_EDGE / 2, PANEL_EDGE / 2 - rows.mean()])
+    right, up = PANEL_LEFT + PANEL_AXES / 2, PANEL_BELOW + PANEL_AXES / 2
+    return np.array([columns.mean() - right, PANEL_EDGE - up - rows.mean()])
 
 
 def test_the_first_view_is_marked_in_its_position():

@@ -146,7 +146,7 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, lis
 
     Args:
         path: path of the file.
-        what: they are, in messages.
+        what: name of the numbers in messages.
         names: pattern of the name of a table's column.
 
     Raises:

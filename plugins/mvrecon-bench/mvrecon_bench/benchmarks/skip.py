@@ -6,6 +6,7 @@ the nonzero voxels, as a careful user would crop by hand. Their times exclude th
 determines the box; those of all other modes include it.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -170,6 +171,13 @@ TASKS: dict[str, Callable[[Bed, str], SkipTrial]] = {
     **{"forward": forward, "forward_static": forward_static, "adjoint": adjoint},
     f"sirt{ITERATIONS}": reconstruction,
 }
+#: What each does, for the picture.
+TOLD = {
+    "forward": "projection, with the search for voxels",
+    "forward_static": "projection within a given support",
+    "adjoint": "back-projection into a given support",
+    f"sirt{ITERATIONS}": f"{ITERATIONS} iterations of SIRT, with the hull",
+}
 
 
 class Skip(Bench):
@@ -321,13 +329,19 @@ def difference(result: Tensor, reference: Tensor | None) -> Row:
     return {"error": (result - reference).abs().max().item(), "differing": int((a != b).sum())}
 
 
+def _filled(row: Row) -> str:
+    """A scene's name, with the share of voxels that it fills in place of digits, where known."""
+    name, share = row["scene"].replace("_", " "), number(row, "occupancy")
+    return name if math.isnan(share) else f"{name.rstrip('0123456789')}, {100 * share:.0f} %"
+
+
 def panels(rows: Iterable[Row]) -> dict[str, dict[str, list[tuple[str, float]]]]:
-    """Task -> baseline -> (scene, speed-up) for every rig and method, in mode auto."""
+    """What a task does -> baseline -> (scene, speed-up) for every rig and method, in mode auto."""
     curves: dict[str, dict[str, list[tuple[str, float]]]] = {}
     for row in rows:
         if row["mode"] == "auto":
-            kinds = curves.setdefault(row["task"], {text: [] for text in AGAINST.values()})
+            kinds = curves.setdefault(TOLD[row["task"]], {text: [] for text in AGAINST.values()})
             for name, text in AGAINST.items():
                 if (times := number(row, name)) == times:
-                    kinds[text].append((row["scene"], times))
+                    kinds[text].append((_filled(row), times))
     return {task: kinds for task, kinds in curves.items() if all(kinds.values())}
