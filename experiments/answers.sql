@@ -113,3 +113,6 @@ union all select printf('from %d of %d starts with one view and with two', min(f
 union all select printf('in %.1f to %.1f s of a CPU thread', min(seconds), max(seconds)) from descents where part = 'mvrecon'
 union all select printf('%.0f to %.0f times as long', min(a.seconds / b.seconds), max(a.seconds / b.seconds)) from descents a join descents b on b.views = a.views and b.part = 'mvrecon'
   where a.part = 'nanodrr, same descent'
+union all select printf('(%+.2f +- %.2f dB for `cross_view`)', avg(own.psnr - unet.psnr), 2 * stdev(own.psnr - unet.psnr) / sqrt(count(*)))
+  from [experiments/22_dcspect/cases_footprints.csv] own join [experiments/22_dcspect/cases_footprints.csv] unet
+  on unet.[case] = own.[case] and unet.method = 'world_unet' where own.method = 'cross_view'
