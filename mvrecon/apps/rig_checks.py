@@ -15,12 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.apps.scan import Scan
+from mvrecon.apps.scan import Scan, field_box
 from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import auto_grid, resolution
+from mvrecon.geometry.cameras.field import resolution
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.classical.orbit import orbit_of
@@ -271,15 +271,8 @@ def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:
 
 
 def coarse_grid(scan: Scan) -> Grid:
-    """A coarse grid of the scan's box, or of the field of half of the views if that is larger."""
-    box = scan.grid
-    with suppress(ValueError):  # of a rig without a common field
-        field = auto_grid(scan.cameras, seen_by=0.5)
-        sizes = [
-            [n * mm for n, mm in zip(grid.size, grid.spacing, strict=True)] for grid in (field, box)
-        ]
-        if all(a >= b * (1 - 1e-6) for a, b in zip(*sizes, strict=True)):
-            box = field
+    """A coarse grid of the scan's box and the field of half of the views."""
+    box = field_box(scan.cameras, scan.grid)
     return coarse(box, SLICE_VOXELS if 1 in box.shape else VOLUME_VOXELS)
 
 
