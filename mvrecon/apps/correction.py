@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.apps.progress import Bar
-from mvrecon.apps.scan import Scan, ViewsInMemory
+from mvrecon.apps.scan import Scan, ViewsInMemory, field_box, share_beside
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
@@ -40,6 +40,8 @@ from mvrecon.operators.operator import LinearOperator
 
 #: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
 MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
+#: Share of the line integrals beside the grid from which on the object extends beyond it.
+MAX_BESIDE = 0.02
 #: Arrays of the views' size that a fit holds.
 HELD_ARRAYS = 8
 #: f(A, views) -> aligned views, and the errors of their cameras.
@@ -121,8 +123,9 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     """The scan with the rig and the gains fitted to its views, and the estimate in pixels of the
     scan and degrees.
 
-    The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, and pixels binned to the
-    size of a voxel's image; a shared offset is then refined on one slice.
+    The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, or where the object
+    extends beyond it, for the field of half of the views, and pixels binned to the size of a
+    voxel's image; a shared offset is then refined on one slice.
 
     Raises:
         ValueError: as `calibrated`.
@@ -130,15 +133,17 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     bar.phase("reading")
     whole = scan.measured.whole()
     pixels = _filled(whole, 1, scan.counts)
-    cut = cut_sides(pixels)
-    box = _grown(scan.grid) if cut.all(dim=-1).any() else scan.grid
-    grid = coarse(box, MAX_GRID_VOXELS)
-    joined = _joined(scan, grid)
-    rig = scan.cameras.binned(joined)
+    cut, box = cut_sides(pixels), scan.grid
 
     def operator_of(grid, cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
 
+    if share_beside(operator_of(coarse(box, MAX_GRID_VOXELS), scan.cameras), pixels) > MAX_BESIDE:
+        box = field_box(scan.cameras, box)
+    box = _grown(box) if cut.all(dim=-1).any() else box
+    grid = coarse(box, MAX_GRID_VOXELS)
+    joined = _joined(scan, grid)
+    rig = scan.cameras.binned(joined)
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
     fit = calibrated(

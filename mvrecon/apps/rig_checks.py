@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.apps.scan import Scan
+from mvrecon.apps.scan import Scan, field_box
 from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import Region
@@ -28,6 +28,8 @@ from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.classical.truncation import CUT_EDGE, edge_shares, ends_of
 from mvrecon.operators.operator import Scaled
 
+#: Size of the field relative to the grid's from which on a grid holds a part of the object.
+FAR_LARGER = 2.0
 #: Voxels along the longest side of a slice and of a volume, and views.
 SLICE_VOXELS, VOLUME_VOXELS, MAX_VIEWS = 32, 24, 40
 #: Standard deviation of the views' blur, in coarse pixels.
@@ -271,7 +273,9 @@ def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:
 
 
 def coarse_grid(scan: Scan) -> Grid:
-    """A coarse grid of the scan's box, or of the field of half of the views if that is larger."""
+    """A coarse grid of the scan's box; of the field of half of the views if that is larger, and of
+    both if that is far larger along an axis, as of a slice.
+    """
     box = scan.grid
     with suppress(ValueError):  # of a rig without a common field
         field = auto_grid(scan.cameras, seen_by=0.5)
@@ -280,6 +284,9 @@ def coarse_grid(scan: Scan) -> Grid:
         ]
         if all(a >= b * (1 - 1e-6) for a, b in zip(*sizes, strict=True)):
             box = field
+    whole = field_box(scan.cameras, box)
+    if any(n >= FAR_LARGER * own for n, own in zip(whole.size, box.size, strict=True)):
+        box = whole
     return coarse(box, SLICE_VOXELS if 1 in box.shape else VOLUME_VOXELS)
 
 

@@ -1,5 +1,6 @@
 """A scan's rig is calibrated at reduced resolution and returned at full resolution."""
 
+import pytest
 import torch
 
 from mvrecon.apps import correction
@@ -7,9 +8,10 @@ from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan
 from mvrecon.data.projections.views import Corrected
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
-from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, coarse, voxel_centres
 from mvrecon.operators.drr import Drr
+from mvrecon.operators.radon import Radon
 
 GRID = Grid.centred(size=(32, 28, 24), spacing=(3.0, 3.0, 4.0))
 RIG = circular(20, 400.0, 600.0, {"pixels": [48, 64], "pixel_mm": 3.2})
@@ -51,6 +53,38 @@ def test_offset_gains_and_dead_pixels_of_a_scan(monkeypatch):
     kept = fit._replace(kept=["offset_u"], settled=False)
     words = correction.calibration_table(kept, ["offset_u", "gains"])["words"]
     assert "offset_u kept at the nominal value" in words and "still changed" in words
+
+
+GRIDS = {
+    "slice": Grid.centred(size=(40, 40, 1), spacing=2.5),
+    "slice aside": Grid.centred(size=(20, 30, 1), spacing=2.5, centre=(10.0, 0.0, 12.0)),
+    "part": Grid.centred(12, spacing=3.0, centre=(12.0, 5.0, -10.0)),
+    "turned part": Grid.centred(12, spacing=3.0).moved(
+        torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), torch.tensor([4.0, 9.0, 2.0])
+    ),
+}
+
+
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+@pytest.mark.parametrize("name", GRIDS)
+def test_a_grid_of_a_part_of_the_object_calibrates_as_one_of_all_of_it(name, beam):
+    """One slice, or a region: the rig is fitted to all that the views show. Also tried: grids far
+    larger than the field, and slices wider than it.
+    """
+    panel = {"pixels": [48, 64], "pixel_mm": 3.2 if beam == "cone" else 2.0}
+    rig = circular(30, 400.0, 600.0, panel) if beam == "cone" else parallel(30, panel)
+    truth = Misalignment.none(30)
+    truth.offset_px[:, 0] = 2.6
+    places = torch.tensor([[12.0, 5.0, -10.0], [-15.0, 10.0, 12.0], [5.0, -18.0, 0.0]])
+    x = sum(torch.exp(-((voxel_centres(GRID) - p) ** 2).sum(-1) / 128) for p in places)
+    project = Drr if beam == "cone" else Radon
+    views = project(GRID, misaligned(rig, truth))(x.float()[None, None])[0, 0]
+    measured = Measured(views, torch.ones_like(views, dtype=torch.bool))
+    projector = {"name": "drr" if beam == "cone" else "radon"}
+    scan = Scan(measured, rig, GRIDS[name], projector)
+    mended, fit = correction.calibrate(scan, ["offset_u"], "cpu", Bar())
+    assert fit.misalignment.offset_px[0, 0] == pytest.approx(2.6, abs=0.1)
+    assert mended.grid is scan.grid
 
 
 def test_the_coarse_grid_fills_the_same_box():

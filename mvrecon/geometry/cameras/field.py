@@ -31,8 +31,10 @@ MAX_BEYOND = 0.25
 #: Bisection steps to a field's edge: 2^-40 of the rig's size.
 BISECTION_STEPS = 40
 #: Greatest ratio of the detector's widths on both sides of the isocentre in a half fan, and widest
-#: gap between its views, in steps of an even circle.
-MAX_WIDTH_RATIO, MAX_GAP_STEPS = 0.75, 2.0
+#: gap between its views, in steps of an even circle of as many directions, or as an angle.
+MAX_WIDTH_RATIO, MAX_GAP_STEPS, MAX_GAP = 0.75, 2.0, math.radians(15.0)
+#: Views within this angle are exposures of one direction, as encoders repeat it.
+SAME_ANGLE = math.radians(0.05)
 
 
 def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -176,7 +178,9 @@ def full_fan(cameras: Cameras) -> Cameras:
     axes = torch.linalg.svd(ways).Vh  # of a circle, the last one is the axis of rotation
     angles = torch.atan2(ways @ axes[1], ways @ axes[0]).sort().values
     gaps = torch.cat([angles, angles[:1] + 2 * math.pi]).diff()
-    if not one_sided or len(rig) < 3 or gaps.max() > MAX_GAP_STEPS * 2 * math.pi / len(rig):
+    directions = int((gaps > SAME_ANGLE).sum())
+    widest = max(MAX_GAP, MAX_GAP_STEPS * 2 * math.pi / max(1, directions))
+    if not one_sided or directions < 3 or gaps.max() > widest:
         return cameras
     more = math.ceil((left - right).abs().max().item() - 1e-6)
     first = cameras.source.new_tensor([[-float(more) if left[0] < right[0] else 0.0, 0.0]])

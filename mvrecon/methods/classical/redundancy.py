@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import SAME_ANGLE
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.orbit import Orbit, along, fan_coordinate, orbit_of
 
@@ -36,8 +37,8 @@ GAP_STEPS, MIN_GAP, MAX_STEP_ANGLE = 5.0, math.radians(2.0), math.radians(125.0)
 #: Views closer than this part of the usual step are exposures at one angle, and share its cell.
 EXPOSURE_STEP_SHARE = 0.2
 #: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step
-#: and than an even one. Views within the second angle are exposures of one, as encoders repeat it.
-NAMED_GAP, SAME_ANGLE = math.radians(8.0), math.radians(0.05)
+#: and than an even one.
+NAMED_GAP = math.radians(8.0)
 #: The usual step is the least one such that steps up to it make up this part of the measured arc.
 USUAL_STEP_SHARE = 0.3
 #: A line that no ray measures is replaced by views within this angle, or within so many steps.

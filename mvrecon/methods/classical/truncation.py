@@ -40,8 +40,8 @@ CONTINUED_EDGE = 0.1
 #: Standard deviations of noise beyond which an edge shows an object, and the share of the views
 #: that show one from which a warning is given.
 MIN_DEVIATIONS, WARNED_VIEWS = 3.0, 0.1
-#: The same of the first and the last row of any view, and the standard deviations that no mean of
-#: thousands exceeds by chance.
+#: The same of the first and the last row of any group of views, and the standard deviations that
+#: none of hundreds of means exceeds by chance.
 ROW_EDGE, ROW_DEVIATIONS = 0.02, 5.0
 #: What air reads is the lower quartile of the edges, up to a flat field that is a tenth off, and
 #: less than this part of the greatest line integral.
@@ -113,17 +113,32 @@ def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
 
 
 def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
-    """Whether an object reaches the first or the last row of any view: a mean over a block of its
-    columns is above noise and above what air reads, which is the lowest of these means.
+    """Whether an object reaches the first or the last row of any group of views: a mean over a
+    block of their columns is above noise and above what air reads, the lowest of these means.
 
     Args:
         edges: edges of the views' columns, `edges_of(views.mT)`.
     """
-    edges, _, _, level, _, noise = edges.split(PARTS, dim=-2)
-    noise = torch.maximum(noise, noise.mean(dim=2, keepdim=True))  # that of a view is a rough one
-    top, lowest = level.amax(dim=(2, 3, 4), keepdim=True), edges.amin(dim=(2, 3, 4), keepdim=True)
+    edges = edges.flatten(0, 1)
+    top = edges.split(PARTS, dim=-2)[3].amax(dim=(1, 2, 3))[:, None, None]
+    ends, *_, noise = _grouped(edges).split(PARTS, dim=-2)
+    noise = noise / math.sqrt(_per_group(edges))
+    # that of sixteen pixels is half as much by chance somewhere
+    noise = torch.maximum(noise, noise.movedim(1, 0).flatten(1).median(dim=1).values[:, None, None])
+    lowest = ends.amin(dim=(0, 2, 3))[:, None, None]
     air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
-    return bool((edges - air > ROW_EDGE * top + ROW_DEVIATIONS * noise).any())
+    return bool((ends - air > ROW_EDGE * top + ROW_DEVIATIONS * noise).any())
+
+
+def _grouped(x: Float[Tensor, "k m n i"]) -> Float[Tensor, "g k n i"]:
+    """Means over groups of consecutive views."""
+    parts = x.tensor_split(min(VIEW_GROUPS, x.shape[1]), dim=1)
+    return torch.stack([part.mean(dim=1) for part in parts])
+
+
+def _per_group(edges: Float[Tensor, "k m n i"]) -> int:
+    """The least number of views in a group."""
+    return edges.shape[1] // min(VIEW_GROUPS, edges.shape[1])
 
 
 def truncated(edges: Float[Tensor, "b c k 10 i"]) -> Bool[Tensor, "b c k 1 1"]:
@@ -223,19 +238,14 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     views measure better do not count.
     """
     edges = edges.flatten(0, 1)
-    count = min(VIEW_GROUPS, edges.shape[1])
-
-    def grouped(x: Float[Tensor, "k m n i"]) -> Float[Tensor, "g k n i"]:
-        return torch.stack([part.mean(dim=1) for part in x.tensor_split(count, dim=1)])
-
     ends, nexts, shares, level, greatest, noise = edges.split(PARTS, dim=-2)
     used = (shares > 0.5).to(ends)
-    seen = grouped(used)
-    ends, nexts = (divided(grouped(x * used), seen, -math.inf) for x in (ends, nexts))
-    most, top = (grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
+    seen = _grouped(used)
+    ends, nexts = (divided(_grouped(x * used), seen, -math.inf) for x in (ends, nexts))
+    most, top = (_grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
     known, beside = (torch.where(seen > 0, x, torch.nan) for x in (ends, nexts))
     sure, possible = _air(known, beside, top)
-    noise = grouped(noise) / math.sqrt(edges.shape[1] // count)
+    noise = _grouped(noise) / math.sqrt(_per_group(edges))
 
     def cut_beyond(air: Float[Tensor, "k n 1"]) -> Bool[Tensor, "g k i"]:
         return (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)

@@ -14,7 +14,7 @@ from mvrecon.geometry.cameras.coverage import (
     fit_detector,
     fitted,
 )
-from mvrecon.geometry.cameras.field import auto_grid, half_fan, sees
+from mvrecon.geometry.cameras.field import auto_grid, full_fan, half_fan, sees
 from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.cameras.rigs import arc, circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
@@ -194,6 +194,38 @@ def test_rigs_from_files_take_a_fitted_detector_where_it_does_not_move_them(tmp_
     with pytest.raises(ValueError, match="pixel_mm of the detector of the camera 'matrices'"):
         camera = {"name": "matrices", "path": f"{tmp_path}/rig.txt"}
         fitted({**camera, "detector": {"pixels": 48, "pixel_mm": "fit"}}, PATIENT)
+
+
+def at(angles, make=circular, *lengths):
+    """Half fans, or half acquisitions of parallel beams, at these angles."""
+    return make(len(angles), *lengths, detector=HALF, angles=angles)
+
+
+#: Angles of complete turns that are not even: exposures, exactly repeated or by a coarse encoder,
+#: clusters, lost neighbours, both ends of the turn; and of arcs.
+TURN = [2.0 * k for k in range(180)]
+AROUND = {
+    "exposures": [a for a in TURN for _ in range(4)],
+    "encoder": [a + 0.01 * k for a in TURN for k in range(3)],
+    "clusters": [6.0 * k + 0.4 * n for k in range(60) for n in range(5)],
+    "lost": TURN[:50] + TURN[54:],
+    "both ends": [*TURN, 360.0],
+    "turns": [3.0 * k for k in range(300)],
+}
+ARCS = {"340 degrees": TURN[:171], "exposures over 220": [a for a in TURN[:111] for _ in range(4)]}
+
+
+@pytest.mark.parametrize("beam", [(circular, 400.0, 800.0), (parallel,)])
+@pytest.mark.parametrize("name", [*AROUND, *ARCS])
+def test_a_half_fan_covers_all_directions_however_uneven(name, beam):
+    """The complete field is that of an even turn. Also tried: 8 to 24 directions, one measured
+    each time once to five times.
+    """
+    rig, whole = at({**AROUND, **ARCS}[name], *beam), at(TURN, *beam)
+    assert half_fan(rig) == (name in AROUND)
+    if name in AROUND:
+        grid, expected = (auto_grid(full_fan(each)) for each in (rig, whole))
+        assert grid.size == pytest.approx(expected.size, abs=1)
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from mvrecon.core.numbers import generator
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.field import auto_grid, full_fan
 from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
@@ -223,6 +224,26 @@ def test_noise_of_few_photons_is_no_part_beyond_the_rows(photons, beyond):
             warnings.simplefilter("always")
             fdk(Drr(grid, rig), -(counts / photons).log())
         assert any("above or below the rows" in str(one.message) for one in caught) == beyond
+
+
+@pytest.mark.parametrize("views", [12, 90])
+@pytest.mark.parametrize("noise", [0.01, 0.03, 0.1])
+def test_noise_is_no_object_beyond_the_rows_and_hides_none(views, noise):
+    """Noise of up to twice the greatest line integral of a ball that all views see whole. Also
+    tried: Poisson noise of 30 to 1e5 photons, and balls of a twentieth of the value.
+    """
+    rig = circular(views, 400.0, 800.0, {"pixels": [48, 96], "pixel_mm": 5.0})
+    grid, turn = auto_grid(rig), torch.eye(3)[None]
+    size, value = torch.full((1, 3), 45.0), torch.tensor([noise / 180.0])
+    ball = Phantom((Solids("ellipsoid", torch.zeros(1, 3), turn, size, value),))
+    for seed in range(3):
+        noisy = noise * torch.randn(1, 1, views, 48, 96, generator=generator(seed, views))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            fdk(Drr(grid, rig), views_of(ball, rig) + noisy)
+    long = views_of(cylinder(height=600.0), rig)
+    with pytest.warns(UserWarning, match="above or below the rows"):
+        fdk(Drr(grid, rig), long + long.max() / 20 * noisy / noise)
 
 
 @pytest.mark.parametrize("kind", ["fan", "parallel"])
