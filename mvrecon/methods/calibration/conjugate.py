@@ -25,10 +25,10 @@ REACH, MIN_REACH = 0.1, 4
 #: Steps in pixels of the parabola that is fitted at the best shift, the second one where the
 #: uncertainty by noise is below the third figure; fits, each at the last one's minimum.
 STEP, FINE_STEP, FINE_ERROR, FITS = 0.5, 0.25, 0.05, 5
-#: Greatest deviation of a step between two views' angles, relative to it.
-MAX_STEP_DEVIATION = 0.02
+#: Greatest deviation of a step between two views' angles, relative to it, and fewest views.
+MAX_STEP_DEVIATION, MIN_VIEWS = 0.02, 8
 #: Uncertainty in pixels without noise, in standard errors, and the largest of a shift found.
-LEAST_PX, STANDARD_ERRORS, MOST_PX = 0.02, 3.0, 0.25
+LEAST_PX, STANDARD_ERRORS, MOST_PX = 0.02, 3.0, 0.1
 #: Groups of consecutive views whose spread is the standard error: neighbours err alike.
 GROUPS = 24
 
@@ -77,13 +77,16 @@ class _Lines(NamedTuple):
         return (self.rows - before * (1 - a) - behind * a) / variance.sqrt(), inside
 
     def misfit(self, shift: float) -> Float[Tensor, " m"]:
-        """What each view contributes to the mean square of the differences; infinite of fewer than
-        a row of rays.
+        """What each view contributes to the mean square of the differences, without what a column
+        has in all views: flat fields, rings and scatter are the panel's; infinite where fewer than
+        `MIN_VIEWS` views have conjugate rays.
         """
         difference, inside = self.differences(shift)
-        count = inside.sum()
-        squares = (difference.square() * inside).sum(dim=1) / count.clamp_min(1)
-        return squares if count >= self.rows.shape[1] else torch.full_like(squares, torch.inf)
+        count, views = inside.sum(), inside.sum(dim=0)
+        if views.max() < MIN_VIEWS:
+            return self.rows.new_full((len(self.rows),), torch.inf)
+        fixed = (difference * inside).sum(dim=0) / views.clamp_min(1)
+        return ((difference - fixed).square() * inside).sum(dim=1) / count
 
 
 @torch.no_grad()
