@@ -24,7 +24,7 @@ from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.geometry.rigid import unit
 from mvrecon.methods.calibration.alignment import blurred
-from mvrecon.methods.calibration.axis import refined_axis
+from mvrecon.methods.calibration.axis import KEPT, refined_axis
 from mvrecon.methods.calibration.conjugate import conjugate_axis
 from mvrecon.methods.calibration.from_data import (
     KINDS,
@@ -143,10 +143,8 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
 
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
-    known = {}
-    if "offset_u" in free:
-        axis = conjugate_axis(scan.cameras, pixels, box)
-        known = {"offset_u": axis.offset / joined} if axis.uncertainty < math.inf else {}
+    axis = conjugate_axis(scan.cameras, pixels, box) if "offset_u" in free else KEPT
+    known = {} if axis == KEPT else {"offset_u": axis.offset / joined}
     fit = calibrated(
         partial(operator_of, grid),
         rig,

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.calibration.axis import Axis
+from mvrecon.methods.calibration.axis import KEPT, Axis
 from mvrecon.methods.calibration.from_data import MAX_LEFT_OUT
 from mvrecon.methods.classical.orbit import Orbit, fan_coordinate, orbit_of
 
@@ -103,16 +103,16 @@ def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Gr
         views: measured integrals.
         grid: a box about the object.
     """
-    kept = Axis(0.0, math.inf)
     lines = _lines(cameras, views, grid)
     if lines is None:
-        return kept
+        return KEPT
     reach = max(MIN_REACH, int(REACH * lines.rows.shape[1]))
     sums = torch.stack([lines.misfit(s).sum() for s in range(-reach, reach + 1)])
     best = float(sums.argmin()) - reach
     if abs(best) == reach or not sums.isfinite().any():
-        return kept
+        return KEPT
     step, five = STEP, torch.arange(-2.0, 3.0, dtype=torch.float64)
+    change = error = left = math.inf
     for _ in range(FITS):
         places = step * five
         misfits = torch.stack([lines.misfit(best + place) for place in places.tolist()])
@@ -120,15 +120,15 @@ def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Gr
         bend = places.square() - places.square().mean()
         curvature = (2 * (bend @ misfits.sum(dim=1)) / bend.square().sum()).item()
         if not 0 < curvature < math.inf:
-            return kept
+            return KEPT
         change = -slopes.sum().item() / curvature
         best += max(-1.0, min(1.0, change))
         spread = torch.stack([part.sum() for part in slopes.tensor_split(GROUPS)]).norm().item()
         error = STANDARD_ERRORS * spread / curvature
         step = FINE_STEP if error < FINE_ERROR else STEP
-    left = misfits[2].sum() / lines.rows.square().mean()
+        left = (misfits[2].sum() / lines.rows.square().mean()).item()
     if abs(best) > reach or abs(change) > STEP or error > MOST_PX or left > MAX_LEFT_OUT**2:
-        return kept
+        return KEPT
     return Axis(best, max(LEAST_PX, error))
 
 

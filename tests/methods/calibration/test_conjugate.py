@@ -8,11 +8,10 @@ import torch
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.calibration.axis import Axis
+from mvrecon.methods.calibration.axis import KEPT
 from mvrecon.methods.calibration.conjugate import conjugate_axis
 
 GRID = Grid.centred(size=(96, 96, 8), spacing=1.0)
-KEPT = Axis(0.0, math.inf)
 
 
 def rig_of(beam, arc, aside=0.0, columns=96, rows=1, views=120):
