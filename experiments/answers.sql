@@ -9,7 +9,7 @@ skips as (  -- 05
   select task = 'sirt20' as iterated, over_full from [experiments/05_skip/results.csv] where mode = 'auto' and scene in ('derenzo', 'ventricle')
 ),
 axes as (  -- 08
-  select abs([error, px]) as error, beam = 'cone' and arc = 'half turn, truncated' as hard from [experiments/08_calibration/axis.csv] where kept is null
+  select abs([error, px]) as error from [experiments/08_calibration/axis.csv] where kept is null
 ),
 methods as (  -- 11
   select own.ms / rtk.ms as share, 100 * (own.error / rtk.error - 1) as excess from [experiments/11_methods/results.csv] own
@@ -76,7 +76,7 @@ union all select printf('from an error of %.3f to %.3f', max(error) filter (wher
   from [experiments/07_misalignment/results.csv] where misalignment = 'all three'
 union all select printf('Offsets and shifts to %.2f pixels, tilts to %.2f degrees', max(error) filter (where unit = 'px'), max(error) filter (where unit = 'degrees'))
   from [experiments/08_calibration/results.csv]
-union all select printf('the axis to %.2f pixels, %.1f for', max(error) filter (where not hard), max(error) filter (where hard)) from axes
+union all select printf('the axis of noisy views to %.2f pixels', max(error)) from axes
 union all select printf('need %.2f to %.2f of RTK''s time, at errors at most %.0f %% larger', min(share), max(share), max(excess)) from methods
 union all select printf('BSREM of weight 0.003 has %.0f %% less noise', percent) from quieter where method = 'bsrem 0.003'
 union all select printf('of 0.03 %.0f %%', percent) from quieter where method = 'bsrem 0.03'

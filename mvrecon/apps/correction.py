@@ -24,7 +24,8 @@ from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.geometry.rigid import unit
 from mvrecon.methods.calibration.alignment import blurred
-from mvrecon.methods.calibration.axis import refined_axis
+from mvrecon.methods.calibration.axis import KEPT, refined_axis
+from mvrecon.methods.calibration.conjugate import conjugate_axis
 from mvrecon.methods.calibration.from_data import (
     KINDS,
     UNCERTAIN_SHARE,
@@ -123,9 +124,10 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     """The scan with the rig and the gains fitted to its views, and the estimate in pixels of the
     scan and degrees.
 
-    The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, or where the object
-    extends beyond it, for the field of half of the views, and pixels binned to the size of a
-    voxel's image; a shared offset is then refined on one slice.
+    The axis is that of conjugate rays where these determine it. The fit has at most
+    `MAX_GRID_VOXELS` voxels a side for the scan's box, or where the object extends beyond it, for
+    the field of half of the views, and pixels binned to the size of a voxel's image; an axis that
+    is part of it is then refined on one slice.
 
     Raises:
         ValueError: as `calibrated`.
@@ -146,12 +148,22 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     rig = scan.cameras.binned(joined)
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
+    axis = conjugate_axis(scan.cameras, pixels, box) if "offset_u" in free else KEPT
+    known = {} if axis == KEPT else {"offset_u": axis.offset / joined}
     fit = calibrated(
-        partial(operator_of, grid), rig, views, free, rounds=MAX_ROUNDS, monitor=lambda r: bar(*r)
+        partial(operator_of, grid),
+        rig,
+        views,
+        free,
+        rounds=MAX_ROUNDS,
+        monitor=lambda r: bar(*r),
+        known=known,
     )
     by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
-    if "offset_u" in free and "offset_u" not in fit.kept:
+    if known:
+        size["offset_u"] = axis.uncertainty
+    elif "offset_u" in free and "offset_u" not in fit.kept:
         pixels = (pixels / fit.gains[:, None, None].to(pixels)).to(device)
         rig = misaligned(scan.cameras, by)
         axis = refined_axis(operator_of, rig, pixels, box, size["offset_u"] / UNCERTAIN_SHARE)

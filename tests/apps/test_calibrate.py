@@ -1,15 +1,19 @@
 """A scan's rig is calibrated at reduced resolution and returned at full resolution."""
 
+import warnings
+
 import pytest
 import torch
 
 from mvrecon.apps import correction
 from mvrecon.apps.progress import Bar
-from mvrecon.apps.scan import Scan
+from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.data.projections.views import Corrected
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, coarse, voxel_centres
+from mvrecon.methods.calibration.from_data import KINDS
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 
@@ -94,3 +98,34 @@ def test_the_coarse_grid_fills_the_same_box():
     fewer = coarse(fine, 64)
     assert fewer.size == (64, 52, 10)
     assert torch.allclose(fewer.corners(), fine.corners())
+
+
+def test_an_axis_by_conjugate_rays_stays_in_the_fit_of_other_parameters():
+    """Of a cone over a truncated short scan alone, and over a full turn with a tilt of half a
+    degree. Nothing warns that the axis is kept.
+    """
+    rng, turn = torch.Generator().manual_seed(0), torch.eye(3, dtype=torch.float64)
+    centres = (torch.rand(9, 3, generator=rng).double() - 0.5) * torch.tensor([60.0, 60.0, 16.0])
+    centres[0], radii = 0, 3 + 9 * torch.rand(9, 3, generator=rng).double()
+    values = torch.full((9,), 0.02, dtype=torch.float64)
+    panel = {"pixels": [16, 96], "pixel_mm": 1.5}
+    for free, arc, width, tilt in (
+        (["offset_u"], 215.0, 70.0, 0.0),
+        (["offset_u", "tilt"], 360.0, 40.0, 0.5),
+    ):
+        rig = circular(90, 250.0, 375.0, panel, arc_degrees=arc)
+        radii[0] = torch.tensor([width, 0.8 * width, 200.0])
+        solid = Phantom((Solids("ellipsoid", centres, turn.expand(9, 3, 3), radii, values),))
+        truth = Misalignment.none(90)
+        truth.offset_px[:, 0], truth.tilt_degrees[:, KINDS["tilt"].column] = -2.4, tilt
+        views = solid.integrals(*misaligned(rig, truth).rays()).float()
+        measured = ViewsInMemory(views, torch.ones_like(views, dtype=torch.bool))
+        grid = Grid.centred(size=(140, 140, 16), spacing=1.0)
+        scan = Scan(measured, rig, grid, {"name": "drr"})
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            _, fit = correction.calibrate(scan, free, "cpu", Bar())
+        assert not fit.kept and abs(fit.misalignment.offset_px[0, 0] + 2.4) < 0.1
+        assert fit.residual[-1] < fit.residual[0]
+        if tilt:
+            assert abs(fit.misalignment.tilt_degrees[0, KINDS["tilt"].column] - tilt) < 0.2

@@ -55,6 +55,10 @@ class Axis(NamedTuple):
     uncertainty: float
 
 
+#: An axis that is not found.
+KEPT = Axis(0.0, math.inf)
+
+
 @torch.no_grad()
 def refined_axis(
     operator_of: Callable[[Grid, Cameras], Projector],
@@ -86,7 +90,7 @@ def refined_axis(
     try:
         orbit = orbit_of(cameras, grid)
     except ValueError:
-        return Axis(0.0, math.inf)
+        return KEPT
     every = math.ceil(len(cameras) / MAX_VIEWS)
     rig, views = cameras[::every], views[:, :, ::every]
     sides = _sides(grid, orbit)

@@ -20,7 +20,7 @@ its effect on the views far worse than the views themselves.
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import torch
@@ -279,7 +279,8 @@ class Estimate(NamedTuple):
         residual: |S y - A x| / |S y| of the blurred views, for the nominal rig and after each
             round.
         kept: names out of `free`, or of `KINDS` where it is a part of one, that stayed nominal.
-        left_out: |S y - A x| / |S y| of held-out views, for the nominal and the fitted rig.
+        left_out: |S y - A x| / |S y| of held-out views, for the nominal rig with what is known, and
+            for the fitted one.
         settled: whether the fit converged before the last round.
         uncertainty: uncertainty of each kind of parameter that was fitted, out of `KINDS`, in its
             unit.
@@ -359,6 +360,7 @@ def calibrated(
     iterations: int = 15,
     rounds: int = 12,
     monitor: Callable[[Round], object] | None = None,
+    known: Mapping[str, float] | None = None,
 ) -> Estimate:
     """Fit a rig to the measured views alone.
 
@@ -380,6 +382,8 @@ def calibrated(
         iterations: number of conjugate-gradient iterations per round.
         rounds: maximum number of Gauss-Newton steps.
         monitor: called after each round.
+        known: common values out of `free` that are found otherwise, in pixels or degrees; they
+            stay.
 
     Returns:
         The fitted rig, with the misalignment and the gain of each view, and the residual of each
@@ -416,8 +420,10 @@ def calibrated(
     seen = views.any(dim=4).any(dim=3)[0, 0].cpu()  # an empty view has neither gain nor shift
     numbers, views = unknowns(cameras[seen], free), views[:, :, seen]
     nominal = numbers.basis.new_zeros(numbers.basis.shape[:2])
-    kept = _motions_of_the_object(free, cameras[seen])
-    numbers = numbers.without(kept)
+    known = known or {}
+    start = nominal + nominal.new_tensor([known.get(kind, 0.0) for kind in numbers.kinds])
+    kept = [kind for kind in _motions_of_the_object(free, cameras[seen]) if kind not in known]
+    numbers = numbers.without([*kept, *known])
     cut = cut_sides(views).any()
 
     def of_rows(shape: Sequence[int]) -> LinearOperator:
@@ -427,7 +433,7 @@ def calibrated(
     smooth = of_rows(views.shape[2:])(views) if cut else blurred(views, blur_px)
     problem = Problem(operator_of, cameras[seen], numbers, blobs, smooth, of_rows if cut else None)
     while True:
-        fit = _fitted(problem, iterations, rounds, monitor)
+        fit = _fitted(problem, start, iterations, rounds, monitor)
         uncertainty = _uncertainties(problem, fit, iterations)
         lost = [kind for kind, size in uncertainty.items() if size == math.inf]
         if not lost:
@@ -442,15 +448,15 @@ def calibrated(
     if not fit.settled:
         warnings.warn(f"The rig still changed in the last of {rounds} rounds", stacklevel=3)
     values = fit.values
-    left_out = (problem.left_out(nominal, iterations), problem.left_out(values, iterations))
-    if values.any() and left_out[1] > min(left_out[0], MAX_LEFT_OUT):
+    left_out = (problem.left_out(start, iterations), problem.left_out(values, iterations))
+    if (values != start).any() and left_out[1] > min(left_out[0], MAX_LEFT_OUT):
         warnings.warn(
             f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
             f"fitted one with {left_out[1]:.5g} (expected less, and at most {MAX_LEFT_OUT}): the "
             f"nominal rig is kept",
             stacklevel=3,
         )
-        values, kept, uncertainty = nominal, list(free), {}
+        values, kept, uncertainty = start, [name for name in free if name not in known], {}
     single = [kind for name in free for kind in PER_VIEW_KINDS.get(name, ())]
     common = values.new_tensor([kind not in single for kind in every.kinds])
     whole = (values[0] * common).repeat(len(cameras), 1)
@@ -480,14 +486,17 @@ def _motions_of_the_object(free: Sequence[str], cameras: Cameras) -> list[str]:
 
 def _fitted(
     problem: Problem,
+    start: Float[Tensor, "m k"],
     iterations: int,
     rounds: int,
     monitor: Callable[[Round], object] | None,
 ) -> _Fit:
-    """Fit rig and volume, from the nominal rig."""
-    values = problem.unknowns.basis.new_zeros(problem.unknowns.basis.shape[:2])
+    """Fit rig and volume, from a start."""
+    values = torch.zeros_like(start)
     x = cgls(problem.operator(values), problem.views, iterations)
     history = [problem.relative(values, x)]
+    if start.any():
+        values, x = start, cgls(problem.operator(start), problem.views, iterations)
     for number in range(1, rounds + 1):
         last = values
         values, x = improved(problem, values, x, iterations)

@@ -9,7 +9,7 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.calibration.alignment import RootRamp
-from mvrecon.methods.calibration.axis import Axis, refined_axis
+from mvrecon.methods.calibration.axis import KEPT, refined_axis
 from mvrecon.operators.drr import Drr
 from mvrecon.operators.radon import Radon
 
@@ -18,7 +18,6 @@ RADII = torch.tensor([40.0, 7, 9, 6, 4])[:, None].expand(-1, 3)
 VALUES = 0.01 * torch.tensor([1.0, 1, -0.8, 2, 3])
 RODS = Phantom((Solids("cylinder", CENTRES, torch.eye(3).expand(5, 3, 3), RADII, VALUES),))
 GRID = Grid.centred(size=(96, 96, 8), spacing=1.0)
-KEPT = Axis(0.0, math.inf)
 
 
 def rig_of(beam, arc, aside, rows=1):

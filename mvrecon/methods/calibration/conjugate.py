@@ -1,0 +1,153 @@
+"""The axis of rotation from conjugate rays: lines that two views in the sources' plane measure.
+
+The ray at fan angle gamma is that at -gamma of the view half a turn less 2 gamma further (Parker,
+Med. Phys. 9, 1982). Both measure one integral, whatever of the object lies beside, above or below
+the panel, and a shift of the panel by s pixels moves them apart by 2 s: it is right where they
+agree best. No volume is needed: one explains most of such a shift over a truncated half turn, so
+that a fit of both was more than a pixel off.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.grid import Grid
+from mvrecon.methods.calibration.axis import KEPT, Axis
+from mvrecon.methods.calibration.from_data import MAX_LEFT_OUT
+from mvrecon.methods.classical.orbit import Orbit, fan_coordinate, orbit_of
+
+#: Greatest shift relative to the columns, and at least so many.
+REACH, MIN_REACH = 0.1, 4
+#: Steps in pixels of the parabola that is fitted at the best shift, the second one where the
+#: uncertainty by noise is below the third figure; fits, each at the last one's minimum.
+STEP, FINE_STEP, FINE_ERROR, FITS = 0.5, 0.25, 0.05, 5
+#: Greatest deviation of a step between two views' angles, relative to it, and fewest views.
+MAX_STEP_DEVIATION, MIN_VIEWS = 0.02, 8
+#: Uncertainty in pixels without noise, in standard errors, and the largest of a shift found.
+LEAST_PX, STANDARD_ERRORS, MOST_PX = 0.02, 3.0, 0.1
+#: Groups of consecutive views whose spread is the standard error: neighbours err alike.
+GROUPS = 24
+
+
+class _Lines(NamedTuple):
+    """The row of each view that is in the plane of the sources, turned by equal steps in radians.
+
+    Args:
+        rows: its integrals, of the views in their order.
+        camera: the first camera.
+        orbit: the sources' orbit.
+        step: angle between two views.
+    """
+
+    rows: Float[Tensor, "m u"]
+    camera: Cameras
+    orbit: Orbit
+    step: float
+
+    def differences(self, shift: float) -> tuple[Float[Tensor, "m u"], Bool[Tensor, "m u"]]:
+        """Differences between the rays of a shifted panel and their conjugates, in the unit of the
+        views, and which rays have one.
+
+        Conjugates are interpolated, which averages noise. Unless its standard deviation were
+        divided out, panels with conjugates half-way between pixels would agree best.
+        """
+        views, columns = self.rows.shape
+        u = torch.arange(columns, dtype=torch.float64)
+        fan = fan_coordinate(self.camera, self.orbit, u + shift, u.new_zeros(1))[0, 0]
+        sign = 1 if fan[-1] > fan[0] else -1
+        right = torch.searchsorted(sign * fan, -sign * fan).clamp(1, columns - 1)
+        column = right - (fan[right] + fan) / (fan[right] - fan[right - 1])
+        angle = math.pi - (0 if self.camera.parallel else 2) * fan
+        turn = abs(2 * math.pi / self.step)
+        view = torch.arange(views, dtype=torch.float64)[:, None] + angle / self.step
+        view = torch.remainder(view, turn)
+        last = views if abs(turn - views) < 0.5 else views - 1  # the first view follows
+        inside = (view <= last) & (column >= 0) & (column <= columns - 1)
+        i = view.floor().clamp(0, last - 1).long()
+        j = column.floor().clamp(0, columns - 2).long().expand_as(i)
+        a, b = view - i, column - j
+        before, behind = (
+            self.rows[k, j] * (1 - b) + self.rows[k, j + 1] * b for k in (i, (i + 1) % views)
+        )
+        variance = 1 + (a**2 + (1 - a) ** 2) * (b**2 + (1 - b) ** 2)
+        return (self.rows - before * (1 - a) - behind * a) / variance.sqrt(), inside
+
+    def misfit(self, shift: float) -> Float[Tensor, " m"]:
+        """What each view contributes to the mean square of the differences, without what a column
+        has in all views: flat fields, rings and scatter are the panel's; infinite where fewer than
+        `MIN_VIEWS` views have conjugate rays.
+        """
+        difference, inside = self.differences(shift)
+        count, views = inside.sum(), inside.sum(dim=0)
+        if views.max() < MIN_VIEWS:
+            return self.rows.new_full((len(self.rows),), torch.inf)
+        fixed = (difference * inside).sum(dim=0) / views.clamp_min(1)
+        return ((difference - fixed).square() * inside).sum(dim=1) / count
+
+
+@torch.no_grad()
+def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Grid) -> Axis:
+    """Return the shift of all detectors along u by which conjugate rays agree best; 0 with infinite
+    uncertainty for views that do not determine it: of parallel beams over half a turn, without
+    contrast, at unequal steps, or that differ from their conjugates by half of themselves.
+
+    The uncertainty is three standard errors, from the spread of the contributions of
+    groups of views, and at least 0.02 pixels.
+
+    Args:
+        cameras: a rig on a circle, with rows across its axis.
+        views: measured integrals.
+        grid: a box about the object.
+    """
+    lines = _lines(cameras, views, grid)
+    if lines is None:
+        return KEPT
+    reach = max(MIN_REACH, int(REACH * lines.rows.shape[1]))
+    sums = torch.stack([lines.misfit(s).sum() for s in range(-reach, reach + 1)])
+    best = float(sums.argmin()) - reach
+    if abs(best) == reach or not sums.isfinite().any():
+        return KEPT
+    step, five = STEP, torch.arange(-2.0, 3.0, dtype=torch.float64)
+    change = error = left = math.inf
+    for _ in range(FITS):
+        places = step * five
+        misfits = torch.stack([lines.misfit(best + place) for place in places.tolist()])
+        slopes = places @ misfits / places.square().sum()  # of each view
+        bend = places.square() - places.square().mean()
+        curvature = (2 * (bend @ misfits.sum(dim=1)) / bend.square().sum()).item()
+        if not 0 < curvature < math.inf:
+            return KEPT
+        change = -slopes.sum().item() / curvature
+        best += max(-1.0, min(1.0, change))
+        spread = torch.stack([part.sum() for part in slopes.tensor_split(GROUPS)]).norm().item()
+        error = STANDARD_ERRORS * spread / curvature
+        step = FINE_STEP if error < FINE_ERROR else STEP
+        left = (misfits[2].sum() / lines.rows.square().mean()).item()
+    if abs(best) > reach or abs(change) > STEP or error > MOST_PX or left > MAX_LEFT_OUT**2:
+        return KEPT
+    return Axis(best, max(LEAST_PX, error))
+
+
+def _lines(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Grid) -> _Lines | None:
+    """The rows in the plane of the sources; None of rigs or views that have none."""
+    try:
+        orbit = orbit_of(cameras, grid)
+    except ValueError:
+        return None
+    steps = torch.deg2rad(torch.remainder(orbit.angles.diff() + 180, 360) - 180)
+    step = steps.mean().item()
+    middle = cameras.project(orbit.centre[None])[:, 0, 1].median().item()
+    rows, columns = cameras.shape
+    if columns < 2 or not -0.5 <= middle <= rows - 0.5:
+        return None
+    if not (steps - step).abs().max() <= MAX_STEP_DEVIATION * abs(step):
+        return None
+    middle = min(max(middle, 0.0), rows - 1.0)
+    first = min(int(middle), max(0, rows - 2))
+    part = views[0, 0, :, first : first + 2].double().cpu()
+    part = part[:, 0] * (1 - middle + first) + part[:, -1] * (middle - first)
+    return _Lines(part, cameras[:1], orbit, step)
