@@ -76,6 +76,26 @@ def test_a_single_small_volume_is_convolved_like_any_other(shape):
     torch.testing.assert_close(*gradients)
 
 
+@pytest.mark.parametrize("shape", [(2, 2, 2), (2, 5, 7), (2, 1, 3), (1, 4, 4), (3, 4, 2)])
+@pytest.mark.parametrize("channels", [(8, 16), (16, 16), (32, 32), (64, 64)])
+def test_bfloat16_has_the_gradients_of_float32(channels, shape):
+    """Within its rounding, whatever memory held before. Also tried: all sizes of 1 to 4 and 7, two
+    dimensions, and convolutions of two pixels with strides; two slices alone were wrong.
+    """
+    gradients, memory = [], torch.channels_last_3d
+    x = torch.randn(2, channels[0], *shape).to(memory_format=memory)
+    weight = torch.randn(channels[1], channels[0], 3, 3, 3) / 8
+    for narrow in (False, True):
+        leaves = [tensor.clone().requires_grad_() for tensor in (x, weight)]
+        for size in range(4, 19):
+            torch.full((1 << size,), 1e30)  # freed at once
+        with torch.autocast("cpu", torch.bfloat16, enabled=narrow):
+            y = convolution(*leaves)
+        gradients.append(torch.autograd.grad(y.float().square().sum(), leaves))
+    for exact, rounded in zip(*gradients, strict=True):
+        assert (rounded - exact).norm() < 0.03 * exact.norm()
+
+
 def test_bfloat16_is_used_only_on_request_and_with_hardware_support(monkeypatch):
     torch.manual_seed(0)
     network = PlainUNet(2, 2, 1, (4, 8), precision="auto").eval()
