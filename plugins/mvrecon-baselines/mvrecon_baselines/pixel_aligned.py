@@ -44,6 +44,7 @@ def encoded(
     encoder: nn.Module, views: Float[Tensor, "b 1 m v u"]
 ) -> tuple[Float[Tensor, "b m c v u"], Float[Tensor, "b 1 1 1 1"]]:
     """Features of each view relative to the scale of all views, and that scale."""
+    views = views.contiguous()  # else sums and convolutions are rounded in another order
     scale = content_scale(views)
     images = (views / scale).reshape(-1, 1, *views.shape[3:])
     with torch.autocast(views.device.type, enabled=False):  # logits lose accuracy in half precision

@@ -109,6 +109,8 @@ class PrimalDual(nn.Module):
         ValueError: no iterations, or too few channels.
     """
 
+    averages = False  # three copies of a view count as more than one
+
     def __init__(self, iterations: int = 10, channels: int = 5, width: int = 32):
         super().__init__()
         if iterations < 1 or channels < 2 or width < 1:

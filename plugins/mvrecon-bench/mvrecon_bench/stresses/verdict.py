@@ -51,7 +51,7 @@ def judge(case: Case, subject: Subject, limit_s: float = LIMIT) -> Row:
             warnings.simplefilter("ignore")
             measured = float(case.measure(subject))
         verdict = PASS if measured <= allowed else FAIL  # NaN does not pass
-    except DoesNotApply as why:
+    except (DoesNotApply, ImportError) as why:  # or a library is not installed
         verdict, note = LEFT_OUT, str(why)
     except (Exception, SystemExit) as error:  # plugins may raise anything; the plan goes on
         verdict, note = FAIL, reason(error)
