@@ -140,15 +140,16 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     def operator_of(grid, cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
 
-    if share_beside(operator_of(coarse(box, MAX_GRID_VOXELS), scan.cameras), pixels) > MAX_BESIDE:
-        box = field_box(scan.cameras, box)
+    axis = conjugate_axis(scan.cameras, pixels, box) if "offset_u" in free else KEPT
+    about = scan.cameras.shifted(torch.tensor([[axis.offset, 0.0]]))
+    if share_beside(operator_of(coarse(box, MAX_GRID_VOXELS), about), pixels) > MAX_BESIDE:
+        box = field_box(about, box)
     box = _grown(box) if cut.all(dim=-1).any() else box
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
     rig = scan.cameras.binned(joined)
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
-    axis = conjugate_axis(scan.cameras, pixels, box) if "offset_u" in free else KEPT
     known = {} if axis == KEPT else {"offset_u": axis.offset / joined}
     fit = calibrated(
         partial(operator_of, grid),
