@@ -150,10 +150,10 @@ def _index(own: Mapping[str, str], axes: Sequence[tuple[str, int]]) -> int:
 
 def _at(index: int, axes: Sequence[tuple[str, int]]) -> PlaceInSet:
     """The plane of a number, along C, Z and T."""
-    place = dict.fromkeys("CZT", 0)
+    place: dict[str, int] = {}
     for axis, size in axes:
         index, place[axis] = divmod(index, size)
-    return tuple(place[axis] for axis in "CZT")
+    return tuple(place.get(axis, 0) for axis in "CZT")
 
 
 @lru_cache(maxsize=4)
