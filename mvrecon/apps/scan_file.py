@@ -41,6 +41,8 @@ TEXTS = ("views.pattern", "views.dataset")
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
 #: Numbers without a point or the sign of their exponent, which are texts in YAML.
 NUMBER = re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+")
+#: Beginnings of texts that name a file, not a data set of the scan's own.
+FILE = re.compile(r"[.~]|[^:]*:")
 #: What OmegaConf would resolve, outside of comments.
 REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
 
@@ -139,7 +141,7 @@ def _settings(file: Path) -> Iterator[str]:
             return found
         if NUMBER.fullmatch(path):
             return path
-        inside = INSIDE_MARK in marks and (hdf5 or views is None)
+        inside = INSIDE_MARK in marks and (hdf5 or views is None) and not FILE.match(path)
         return _from_root(path) if inside else file.parent / from_home(path)
 
     told = with_paths(told, ReconstructSettings, from_file)

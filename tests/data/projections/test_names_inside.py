@@ -120,8 +120,12 @@ def test_a_missing_file_of_a_scan_is_not_taken_from_where_a_command_runs(tmp_pat
         (tmp_path / folder).mkdir()
         images(tmp_path / folder / name, grey())
     (tmp_path / "scan" / NAME).write_text("views: {path: views, flat: flat}")
+    with h5py.File(tmp_path / "here" / "b.h5", "w") as file:
+        file["flat"] = grey()[0]
     monkeypatch.chdir(tmp_path / "here")
-    assert f"views.flat={tmp_path / 'scan' / 'flat'}" in expanded([f"scan={tmp_path / 'scan'}"])
+    for path, flat in (("views", "flat"), ("scan.h5", "b.h5:/flat"), ("scan.h5", "./flat")):
+        (tmp_path / "scan" / NAME).write_text(f"views: {{path: {path}, flat: '{flat}'}}")
+        assert f"views.flat={tmp_path / 'scan' / flat}" in expanded([f"scan={tmp_path / 'scan'}"])
 
 
 def test_a_file_that_the_scan_does_not_contain_is_read(scan):
