@@ -28,6 +28,7 @@ from mvrecon.core.files.checks import (
     yaml_of,
 )
 from mvrecon.core.options import with_paths
+from mvrecon.core.parts import VIEW_FILES
 from mvrecon.core.quantities import INSIDE_MARK
 from mvrecon.core.registry import hint
 
@@ -40,6 +41,8 @@ TEXTS = ("views.pattern", "views.dataset")
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
 #: Numbers without a point or the sign of their exponent, which are texts in YAML.
 NUMBER = re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+")
+#: Beginnings of texts that name a file, not a data set of the scan's own.
+FILE = re.compile(r"[.~]|[^:]*:")
 #: What OmegaConf would resolve, outside of comments.
 REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
 
@@ -56,13 +59,18 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
 
 def _from_folder(folder: Path, path: str) -> str:
     """A path as it begins in a folder: of a file, or of a data set as <file>:<name>; the name of a
-    data set alone, which is no file, as it was typed.
+    data set alone, which is no file, begins at the root.
     """
     whole, (head, sign, name) = from_home(path), str(path).rpartition(":")
     if not whole.exists() and not sign:
-        return path
+        return _from_root(path)
     place, rest = (whole, "") if whole.exists() else (from_home(head), sign + name)
     return os.path.relpath(place.resolve(), folder.resolve()) + rest
+
+
+def _from_root(name: str) -> str:
+    """The name of a data set that is no file, of any folder in which it is read."""
+    return f"/{name.lstrip('/')}"
 
 
 def expanded(arguments: Sequence[str]) -> list[str]:
@@ -124,11 +132,17 @@ def _settings(file: Path) -> Iterator[str]:
     if "camera" in told:
         told["camera"] = {"name": "from_file"} | told["camera"]
 
+    views = told.get("views", {}).get("path")
+    ending = Path(str(views).partition(":/")[0]).suffix.lower().lstrip(".")
+    hdf5 = ending in VIEW_FILES.names() and VIEW_FILES.takes(ending, "angles")
+
     def from_file(path: str, marks: tuple) -> str | Path:
         if (found := file_in(file.parent, path)) is not None:
             return found
-        text = INSIDE_MARK in marks or NUMBER.fullmatch(path)
-        return path if text else file.parent / from_home(path)
+        if NUMBER.fullmatch(path):
+            return path
+        inside = INSIDE_MARK in marks and (hdf5 or views is None) and not FILE.match(path)
+        return _from_root(path) if inside else file.parent / from_home(path)
 
     told = with_paths(told, ReconstructSettings, from_file)
     for section, options in told.items():

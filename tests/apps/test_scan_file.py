@@ -141,7 +141,7 @@ def test_names_of_data_sets_are_no_paths(folder: Path):
     assert expanded([f"scan={folder}"]) == [
         f"views.path={folder}/a.h5",
         "views.dataset=entry/data",
-        "views.angles=entry/x",
+        "views.angles=/entry/x",
         "views.image_key=/key",
         "views.flat=/entry/open",
     ]
@@ -150,7 +150,7 @@ def test_names_of_data_sets_are_no_paths(folder: Path):
         (folder / NAME).write_text(yaml.safe_dump({"views": {"angles": angles}}))
         assert expanded([f"scan={folder}"]) == [f"views.angles={folder}/b.h5:/entry/x"]
     save(folder / NAME, {"views": {"angles": "entry/x"}})
-    assert expanded([f"scan={folder}"]) == ["views.angles=entry/x"]
+    assert expanded([f"scan={folder}"]) == ["views.angles=/entry/x"]
 
 
 def test_a_name_told_twice_and_one_that_refers_are_refused(folder: Path):

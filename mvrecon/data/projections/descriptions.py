@@ -4,6 +4,7 @@
 
 import math
 import re
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from html import unescape
@@ -15,7 +16,7 @@ import numpy as np
 from mvrecon.core.files.checks import Refused, millimetres, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
-from mvrecon.data.projections.stack import Header, PlaceInSet
+from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
 #: OME's types of pixels.
 TYPES = {f"int{bits}": f"i{bits // 8}" for bits in (8, 16, 32)}
@@ -112,15 +113,47 @@ def places_in_set(text: str) -> dict[str, list[PlaceInSet]]:
     fewer than two files.
     """
     pages: dict[str, list[tuple[int, PlaceInSet]]] = {}
+    sizes = dict(elements(text, "Pixels"))
     for number, image in enumerate(images(text)):
-        for attributes, inside in PLACED.findall(image):
-            own, name = (dict(ATTRIBUTE.findall(part)) for part in (attributes, inside))
-            if "FileName" in name:
-                page = int(own.get("IFD", 0)), _place(number, own, "First")
-                pages.setdefault(unescape(name["FileName"]), []).append(page)
+        axes = _axes(sizes.get(number, {}))
+        found = [[dict(ATTRIBUTE.findall(part)) for part in one] for one in PLACED.findall(image)]
+        starts = sorted(_index(own, axes) for own, _ in found)
+        for own, name in found:
+            if "FileName" not in name:
+                continue
+            first, start = int(own.get("IFD", 0)), _index(own, axes)
+            count = int(own.get("PlaneCount", 1))
+            if not {"IFD", "PlaneCount"} & {*own}:  # all pages of the file
+                after = starts[bisect_right(starts, start) :]
+                count = (after[0] if after else math.prod(n for _, n in axes)) - start
+            run = [(number, *_at(start + k, axes)) for k in range(1, min(count, VIEWS))]
+            those = pages.setdefault(unescape(name["FileName"]), [])
+            those += enumerate([_place(number, own, "First"), *run], first)
     if len(pages) < 2:
         return {}
     return {name: [place for _, place in sorted(those)] for name, those in pages.items()}
+
+
+def _axes(pixels: Mapping[str, str]) -> list[tuple[str, int]]:
+    """The axes of OME's pixels with their sizes; planes run along the first of them first."""
+    order = pixels.get("DimensionOrder", "XYCZT")[2:]
+    return [(axis, max(int(pixels.get(f"Size{axis}", 1)), 1)) for axis in order]
+
+
+def _index(own: Mapping[str, str], axes: Sequence[tuple[str, int]]) -> int:
+    """The number of the first plane of an element, in the order of the axes."""
+    index, step = 0, 1
+    for axis, size in axes:
+        index, step = index + step * int(own.get(f"First{axis}", 0)), step * size
+    return index
+
+
+def _at(index: int, axes: Sequence[tuple[str, int]]) -> PlaceInSet:
+    """The plane of a number, along C, Z and T."""
+    place: dict[str, int] = {}
+    for axis, size in axes:
+        index, place[axis] = divmod(index, size)
+    return tuple(place.get(axis, 0) for axis in "CZT")
 
 
 @lru_cache(maxsize=4)

@@ -178,8 +178,11 @@ def full_fan(cameras: Cameras) -> Cameras:
     axes = torch.linalg.svd(ways).Vh  # of a circle, the last one is the axis of rotation
     angles = torch.atan2(ways @ axes[1], ways @ axes[0]).sort().values
     gaps = torch.cat([angles, angles[:1] + 2 * math.pi]).diff()
-    directions = int((gaps > SAME_ANGLE).sum())
-    widest = max(MAX_GAP, MAX_GAP_STEPS * 2 * math.pi / max(1, directions))
+    directions, last = 0, -math.inf
+    for angle in angles.tolist():  # a fine scan has steps below those of repeated directions
+        if angle - last > SAME_ANGLE:
+            directions, last = directions + 1, angle
+    widest = max(MAX_GAP, MAX_GAP_STEPS * 2 * math.pi / directions)
     if not one_sided or directions < 3 or gaps.max() > widest:
         return cameras
     more = math.ceil((left - right).abs().max().item() - 1e-6)

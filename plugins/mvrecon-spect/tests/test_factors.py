@@ -78,7 +78,8 @@ def test_decay_between_and_within_views_is_undone(tmp_path, settings, every):
     rate, starts = math.log(2) / (4 * TIME), TIME * torch.arange(16).double()
     ends = starts + TIME
     decay = ((-rate * starts).exp() - (-rate * ends).exp()) / (rate * TIME) * math.exp(-60 * rate)
-    np.savetxt(tmp_path / "starts.txt", starts.numpy())
+    lines = "\n".join(map(str, starts.tolist()))
+    (tmp_path / "starts.txt").write_text(f"# s\n{lines}\n", encoding="utf-8-sig")  # by Notepad
     factors = (
         f"factors={{name: detector, half_life_s: {4 * TIME}, start_s: DIR/starts.txt, "
         f"reference_s: -60, time_s: {TIME}, branching: {BRANCHING}}}"

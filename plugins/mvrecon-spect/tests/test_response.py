@@ -82,8 +82,9 @@ def test_an_oblique_ray_penetrates_the_rim_as_the_closed_form(degrees):
     assert math.sqrt(16 * u) == pytest.approx(radial * (1 + m), rel=5e-3)
 
 
-def test_a_measured_response_has_the_widths_of_its_table(tmp_path):
-    """Rows from a known response; also at depths and angles between the rows."""
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_measured_response_has_the_widths_of_its_table(tmp_path, encoding):
+    """Rows from a known response; also at depths and angles between the rows. Excel marks UTF-8."""
     path = tmp_path / "psf.csv"
 
     def widths(depth, degrees):
@@ -96,7 +97,7 @@ def test_a_measured_response_has_the_widths_of_its_table(tmp_path):
             v, u = widths(depth, degrees)
             share = 1 - 0.2 * math.tan(math.radians(degrees)) ** 2
             rows.append(f"{depth},{degrees},{FWHM * u**0.5},{FWHM * v**0.5},{share}")
-    path.write_text("\n".join(rows))
+    path.write_text("\n".join(rows), encoding=encoding)
     for depth, degrees in ((120.0, 0.0), (180.0, 22.0), (100.0, 30.0)):
         v, u = widths(depth, degrees)
         seen, thin = image(degrees, depth, response=path), image(degrees, depth)

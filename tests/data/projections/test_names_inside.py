@@ -90,6 +90,44 @@ def test_a_file_comes_before_a_data_set_of_its_name(way, scan):
         assert (dark == value).all()
 
 
+@pytest.mark.parametrize("path", ["scan.h5", "scan.h5:/raw/frames"])
+def test_files_where_a_command_runs_are_not_those_of_a_scan(path, scan, monkeypatch):
+    """A scan.yaml means the same in every folder, also in one with files of its names, and where a
+    calibration writes it anew beside such files.
+    """
+    here = scan.with_name("here")
+    for name in ("raw/open", "shut", "copy/raw/open", "copy/shut"):
+        (here / name).mkdir(parents=True)
+        images(here / name, np.full((2, *grey().shape[1:]), 9, "u2"))
+    for name in ("turn", "light", "copy/turn"):
+        (here / name).write_text("1\n" * VIEWS)
+    options = {**NAMED, "path": path, "exposure": "light"}
+    options = {k: v for k, v in options.items() if k != "dataset" or path == "scan.h5"}
+    scan.with_name(NAME).write_text(yaml.safe_dump({"views": options}))
+    monkeypatch.chdir(here)
+    for folder in (scan.parent, here / "copy"):
+        words = dict(word.split("=", 1) for word in expanded([f"scan={folder}"]))
+        settings = {key.removeprefix("views."): text for key, text in words.items()}
+        views = typed(here, settings)
+        expected = integrals() + np.log(EXPOSURES)[:, None, None]
+        assert torch.allclose(views.whole().views, torch.from_numpy(expected).float(), atol=2e-6)
+        assert np.allclose(views.stack.rig["angles"], ANGLES)
+        save(here / "copy" / NAME, {"views": settings})
+
+
+def test_a_missing_file_of_a_scan_is_not_taken_from_where_a_command_runs(tmp_path, monkeypatch):
+    for folder, name in (("scan", "views"), ("here", "flat")):
+        (tmp_path / folder).mkdir()
+        images(tmp_path / folder / name, grey())
+    (tmp_path / "scan" / NAME).write_text("views: {path: views, flat: flat}")
+    with h5py.File(tmp_path / "here" / "b.h5", "w") as file:
+        file["flat"] = grey()[0]
+    monkeypatch.chdir(tmp_path / "here")
+    for path, flat in (("views", "flat"), ("scan.h5", "b.h5:/flat"), ("scan.h5", "./flat")):
+        (tmp_path / "scan" / NAME).write_text(f"views: {{path: {path}, flat: '{flat}'}}")
+        assert f"views.flat={tmp_path / 'scan' / flat}" in expanded([f"scan={tmp_path / 'scan'}"])
+
+
 def test_a_file_that_the_scan_does_not_contain_is_read(scan):
     """Of images, by an absolute path, one that begins at home, and in Python."""
     folder = images(scan.with_name("darks"), np.full((2, *grey().shape[1:]), DARK, "u2"))

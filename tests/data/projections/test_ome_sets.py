@@ -100,6 +100,50 @@ def test_a_set_is_read_in_the_order_that_ome_states(case, tmp_path):
     assert stack.names[0].startswith(names[0].split(".")[0].replace("&amp;", "&"))
 
 
+#: Attributes of the elements of files of 7 and 5 pages.
+RUNS = {
+    "all pages of each file": 'FirstT="{first}"',
+    "numbers of planes": 'IFD="0" FirstT="{first}" PlaneCount="{count}"',
+    "numbers of planes alone": 'FirstT="{first}" FirstZ="0" PlaneCount="{count}"',
+}
+
+
+@pytest.mark.parametrize("sizes", ['SizeT="12"', 'DimensionOrder="XYZTC" SizeT="12" SizeC="1"'])
+@pytest.mark.parametrize("run", RUNS)
+def test_an_element_places_several_pages(run, sizes, tmp_path):
+    """Along the axes in their order, in files whose names have another one. Without a page and a
+    number, those up to the next element.
+    """
+    parts = {"b.tif": slice(0, 7), "a.tif": slice(7, 12)}
+    body = "".join(
+        f"<TiffData {RUNS[run].format(first=part.start, count=part.stop - part.start)}>"
+        f'<UUID FileName="{name}">urn:uuid:1</UUID></TiffData>'
+        for name, part in parts.items()
+    )
+    planes = "".join(f'<Plane TheT="{k}" ExposureTime="{k + 1}"/>' for k in range(VIEWS))
+    text = f"<OME><Image><Pixels {sizes}>{body}{planes}</Pixels></Image></OME>"
+    for name, part in parts.items():
+        written(tmp_path / name, grey()[part], description=text.encode())
+    stack = open_projections(tmp_path)
+    assert np.array_equal(stack.read(0, VIEWS).numpy(), grey())
+    assert stack.stated["ExposureTime"] == [f"{1000 * (k + 1)}" for k in range(VIEWS)]
+    with pytest.raises(Refused, match="a place of each of its 8 images .* got 7"):
+        written(tmp_path / "b.tif", grey()[:8], description=text.encode())
+        open_projections(tmp_path)
+
+
+def test_pages_of_an_element_along_two_axes_are_refused(tmp_path):
+    body = "".join(
+        f'<TiffData FirstT="{t}"><UUID FileName="{t}.tif">u</UUID></TiffData>' for t in (0, 3)
+    )
+    sizes = 'DimensionOrder="XYCTZ" SizeC="2" SizeT="6"'
+    text = f"<OME><Image><Pixels {sizes}>{body}</Pixels></Image></OME>"
+    for t in (0, 3):
+        written(tmp_path / f"{t}.tif", grey()[2 * t : 2 * t + 6], description=text.encode())
+    with pytest.raises(Refused, match="got 2 along C and 6 along T"):
+        open_projections(tmp_path)
+
+
 def test_a_companion_describes_its_files(tmp_path):
     folder = stored(tmp_path / "scan", ONE_EACH, binary="scan.companion.ome")
     pages = [(name, 0) for name in ONE_EACH]

@@ -211,8 +211,14 @@ AROUND = {
     "lost": TURN[:50] + TURN[54:],
     "both ends": [*TURN, 360.0],
     "turns": [3.0 * k for k in range(300)],
+    "fine": [0.045 * k for k in range(8000)],
+    "fine, lost": [0.045 * k for k in range(8000) if not 1000 < k < 1200],
 }
-ARCS = {"340 degrees": TURN[:171], "exposures over 220": [a for a in TURN[:111] for _ in range(4)]}
+ARCS = {
+    "fine over 340": [0.045 * k for k in range(7556)],
+    "340 degrees": TURN[:171],
+    "exposures over 220": [a for a in TURN[:111] for _ in range(4)],
+}
 
 
 @pytest.mark.parametrize("beam", [(circular, 400.0, 800.0), (parallel,)])

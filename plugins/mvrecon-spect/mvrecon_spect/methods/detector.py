@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, file_errors
+from mvrecon.core.files.checks import Refused, file_errors, text_of
 from mvrecon.core.quantities import NonNegativeFloat, PositiveFloat
 from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.data.projections.views import MeasuredViews
@@ -130,7 +130,8 @@ def _starts(
     where, count = views.options.path, views.stack.n_views
     if isinstance(start_s, str | Path):
         with file_errors(start_s, "has no starts", "expected one number per line, in s"):
-            start_s = np.loadtxt(Path(start_s).expanduser(), ndmin=1).ravel().tolist()
+            lines = text_of(Path(start_s).expanduser()).splitlines()
+            start_s = np.loadtxt(lines, ndmin=1).ravel().tolist()
     starts = views.stack.starts_s if start_s is None else start_s
     if starts is None:
         raise Refused(

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.checks import text_of
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
@@ -239,8 +240,7 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
     Warns:
         UserWarning: voxels far beyond the table's depths.
     """
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(text_of(path).splitlines()))
     names = set(rows[0]) if rows else set()
     if not set(TABLE) <= names <= {*TABLE, *OPTIONAL}:
         known, got = ", ".join((*TABLE, *OPTIONAL)), ", ".join(sorted(names))
