@@ -295,25 +295,6 @@ def open_scan(
     return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
 
 
-def field_box(cameras: Cameras, grid: Grid) -> Grid:
-    """A grid with more voxels where its box ends inside the field of half of the views, by more
-    than a half of a pixel's image; the grid itself where there is no such field.
-    """
-    try:
-        field = auto_grid(cameras, seen_by=0.5)
-    except ValueError:  # of a rig without a common field
-        return grid
-    low, high = grid.to_index(field.corners()).aminmax(dim=0)
-    slack = max(field.spacing) / 2 / low.new_tensor(grid.spacing)
-    before = (-0.5 - slack - low).ceil().clamp_min(0)
-    behind = (high - low.new_tensor(grid.size) + 0.5 - slack).ceil().clamp_min(0)
-    affine = grid.affine.clone()
-    affine[:3, 3] = grid.to_world(-before)
-    more = (before + behind).long().tolist()
-    x, y, z = (n + k for n, k in zip(grid.size, more, strict=True))
-    return Grid((z, y, x), affine)
-
-
 def share_beside(A: LinearOperator, views: Float[Tensor, "1 1 m v u"]) -> float:
     """The share of the line integrals in pixels whose rays miss an operator's grid, up to noise."""
     reached = A(torch.ones(1, 1, *A.domain_shape, device=A.device)).to(views) > 0
