@@ -19,14 +19,7 @@ import yaml
 from mvrecon.apps.config.grammar import quoted
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import (
-    MAX_YAML_BYTES,
-    Refused,
-    file_in,
-    from_home,
-    text_of,
-    yaml_of,
-)
+from mvrecon.core.files.checks import MAX_YAML_BYTES, Refused, file_in, from_home, text_of, yaml_of
 from mvrecon.core.options import with_paths
 from mvrecon.core.quantities import INSIDE_MARK
 from mvrecon.core.registry import hint
@@ -34,11 +27,11 @@ from mvrecon.core.registry import hint
 NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
-#: Options that are a text of any characters, but those that control a terminal.
+#: Options whose texts may have any characters except control characters.
 TEXTS = ("views.pattern", "views.dataset")
 #: Values: numbers, words, products of names or patterns of them, and paths; nothing that refers.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
-#: Numbers without a point or the sign of their exponent, which are texts in YAML.
+#: Numbers that YAML 1.1 reads as texts, as they have no point or no sign of the exponent.
 NUMBER = re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+")
 #: What OmegaConf would resolve, outside of comments.
 REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
@@ -55,8 +48,8 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
 
 
 def _from_folder(folder: Path, path: str) -> str:
-    """A path as it begins in a folder: of a file, or of a data set as <file>:<name>; the name of a
-    data set alone, which is no file, as it was typed.
+    """A path of a file, or of a data set as <file>:<name>, relative to a folder; the name of a data
+    set alone, which is no file, as it was typed.
     """
     whole, (head, sign, name) = from_home(path), str(path).rpartition(":")
     if not whole.exists() and not sign:

@@ -11,13 +11,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from mvrecon.core.files.checks import (
-    Refused,
-    check_file,
-    file_errors,
-    millimetres,
-    shown,
-)
+from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import (
     VIEW_AXES,
