@@ -86,8 +86,8 @@ def expanded(arguments: Sequence[str]) -> list[str]:
 
 
 def _found(place: Path) -> Path:
-    """The file: itself, in a folder, that of the only calibration there, or that of the only case
-    of a simulation.
+    """The description at a place: a file, or in a folder its own, that of its only calibration, or
+    that of the only case of a simulation.
     """
     if place.is_file():
         return place
