@@ -144,7 +144,7 @@ def reconstruct(
         scan: the views as measured.
         method: the method that reconstructs them.
         output: files to write.
-        corrections: those made before the reconstruction.
+        corrections: corrections before the reconstruction.
         settings: settings of the run; `left_out`: also predict each view from all others, by one
             more reconstruction each.
         device: device to compute on.
@@ -235,9 +235,9 @@ def save_calibration(
 
     Args:
         nominal: the scan before the calibration.
-        fitted: its cameras after it.
+        fitted: the scan's cameras after it.
         free: parameters that were fitted.
-        grid: its settings.
+        grid: settings of the scan's grid.
         output: files to write.
 
     Raises:

@@ -144,7 +144,7 @@ class Rig(NamedTuple):
         squares: squared norm of each view's residual after `SEARCH_ITERATIONS`, relative to that of
             all views.
         words: how the views fit this rig better, in words; empty for the stored one.
-        cure: what the user is asked.
+        cure: question that the warning asks the user.
         order: order of the views' axes, one of `ORDERS` or `STORED_ORDER`.
     """
 
@@ -167,9 +167,9 @@ class SomeViews(NamedTuple):
         scan: the scan, of line integrals.
         numbers: numbers of the views.
         first: the first view as it is stored.
-        region: the pixels that are joined to one.
-        cameras: stored ones of the coarse views.
-        grid: coarse, about as large as what the views show.
+        region: crop and binning from the detector to the coarse views.
+        cameras: the rig as stored, for the coarse views.
+        grid: coarse grid, about as large as what the views show.
         cut: whether views end inside the object at the first and the last row, and at the first and
             the last column: a half fan ends at one.
         views: blurred means of the measured pixels.

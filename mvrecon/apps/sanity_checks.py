@@ -71,7 +71,7 @@ def sanity_checks(
     Args:
         scan: the scan that was reconstructed.
         method: name of the method.
-        outcome: its volume, in the unit of the views per mm.
+        outcome: what the method made, with a volume in the unit of the views per mm.
         device: device that computes the comparison.
         as_read: the views before a correction, which leaves no whole counts; None: the scan's.
     """

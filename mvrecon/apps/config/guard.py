@@ -237,7 +237,7 @@ def run_once(task: Callable[[DictConfig], Any], config: DictConfig, app: str, co
     """Run a task with a plain config; `hydra.main` does the same, but composes it twice more.
 
     Args:
-        task: whose errors pass through Hydra.
+        task: function f(config), whose errors pass through Hydra.
         config: composed and checked config.
         app: name of the app and of its log file.
         conf: folder of mvrecon's configs.

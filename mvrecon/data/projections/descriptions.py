@@ -141,8 +141,8 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
     """The header of one page with what Micro-Manager and Dectris state of it.
 
     Args:
-        file: for messages.
-        head: by the tags of the page.
+        file: path of the file, for messages.
+        head: the header by the tags of the page.
         text: the description of the page.
         manager: metadata of Micro-Manager, None of others.
 

@@ -417,7 +417,7 @@ def _dicom_header(file: Path) -> Header:
 
 
 def _texts(image: DicomImage, name: str) -> list[str]:
-    """What an image states by a name of each frame; "" of none."""
+    """An attribute of each frame of an image as text; "" where it is not stated."""
     single = image.groups and image.stated(name)
     found = (
         {str(value) for _, value in image.stated(name, k)}

@@ -196,7 +196,7 @@ def in_another(name: str | Path) -> Place | None:
 
 
 class _Layout(NamedTuple):
-    """Where a file has what."""
+    """The data sets of a scan in an HDF5 file."""
 
     frames: Place
     key: Place | None = None
@@ -218,7 +218,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def of(cls, path: Path, dataset: str | None, sinogram: bool) -> "_Layout":
-        """Find it in a file, by the name of the frames if given."""
+        """The layout of a file, by the name of the frames if given."""
         wanted = None if dataset is None else named(path, dataset)
         only = None if wanted is None else address(wanted)
         found, lost, names = {}, [], []
@@ -257,7 +257,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def _tomo(cls, path: Path, group: str, frames: Place) -> "_Layout":
-        """Of NXtomo, by the group with the frames and their keys."""
+        """The layout of NXtomo, by the group with the frames and their keys."""
 
         def first(*names: str) -> Place | None:
             parts = group.strip("/").split("/")
@@ -310,7 +310,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def _exchange(cls, path: Path, frames: Place, sinogram: bool) -> "_Layout":
-        """Of Data Exchange."""
+        """The layout of Data Exchange."""
         order = "y:theta:x" if sinogram else "theta:y:x"
         axes = texts_at([frames], "axes", EXPECTED).get(frames)
         if axes is not None and axes.replace(" ", "") != order:
@@ -402,7 +402,7 @@ class _Layout(NamedTuple):
         )
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
-        """Rows' and columns' pitch; None if the file has none with units."""
+        """Pixel size (v, u) in mm; None if the file has none with units."""
         for pair in self.pixel:
             sizes = []
             for place in pair:
@@ -419,7 +419,7 @@ class _Layout(NamedTuple):
 
 
 def _members(path: Path, entry: str, name: str) -> list[str]:
-    """The names of what is in a group of an entry, behind that of the group."""
+    """The members of a group of an entry, as <group>/<member>; none if it is not there."""
     if (place := there(path, f"{entry}/{name}")) is None:
         return []
     with opened(place.path, EXPECTED) as file:
