@@ -560,7 +560,7 @@ def alignments(
     green ring, under a legend.
 
     A tile's centre is an error-free camera, its circle a pixel; larger shifts are clamped to its
-    edge. At most four tiles a row.
+    edge. At most four tiles per row.
 
     Args:
         shift_px: estimated shifts, along columns (to the right) and rows (downwards).
