@@ -183,7 +183,7 @@ class OfCases(Wrapped):
 OBJECT = 0.8
 #: Cells per axis of a grid's box whose centres are tested for visibility by the pinholes.
 COARSE = 32
-#: Tolerance of the width of a pixel in voxels, and cosine of the angle between rows and columns.
+#: Tolerance of the width of a pixel in voxels, and of the cosine between rows and columns.
 WIDER, SKEW = 1e-6, 0.01
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
