@@ -193,8 +193,8 @@ def own_folder(config: DictConfig, sweeps: bool) -> list[str]:
     settings that it varies. Hydra's log file appears with its first message.
 
     Args:
-        config: composed, of a sweep from what it does not vary.
-        sweeps: whether it is of a sweep.
+        config: composed config; for a sweep, without the settings that it varies.
+        sweeps: whether the command line asks for a sweep.
 
     Raises:
         OSError: the folder cannot be made.

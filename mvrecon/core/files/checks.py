@@ -59,7 +59,7 @@ def millimetres(where: object, unit: str) -> float:
 
     Args:
         where: source of the unit, for the message.
-        unit: such as "um", "Micron" or "micrometre".
+        unit: name of the unit, such as "um", "Micron" or "micrometre".
 
     Raises:
         Refused: an unknown unit.

@@ -157,9 +157,16 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
                 head = head._replace(tops=_tops(file, "BitDepth", bits, head))
         if ms is not None:
             _add(stated, "ExposureTime", 0, milliseconds(file, ms, "ms"))
+    head = head._replace(stated=stated)
     entries = dict(LINE.findall(text)) if "#" in text else {}
-    if not {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
-        return head._replace(stated=stated)
+    if {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
+        return _of_dectris(file, head, entries)
+    return head
+
+
+def _of_dectris(file: Path, head: Header, entries: Mapping[str, str]) -> Header:
+    """The header of a page with the entries of a detector of Dectris, as texts by name."""
+    stated = {name: list(texts) for name, texts in head.stated.items()}
 
     def numbers(name: str, count: int = 1) -> tuple[list[float], str]:
         text = THOUSANDS.sub("", entries[name]) if name == "Count_cutoff" else entries[name]

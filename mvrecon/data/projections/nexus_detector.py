@@ -115,9 +115,9 @@ def limits_of(
     it does not state. Compares the order of the frames.
 
     Args:
-        detector: the group; None: of a file that has none.
-        frames: all of the file.
-        keys: the image_key of each.
+        detector: group of the detector; None of a file without one.
+        frames: all frames of the file.
+        keys: image_key of each frame.
 
     Warns:
         UserWarning: a mask of another size, other values than one number, an underload.
