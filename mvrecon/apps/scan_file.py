@@ -19,7 +19,14 @@ import yaml
 from mvrecon.apps.config.grammar import quoted
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import MAX_YAML_BYTES, Refused, file_in, from_home, text_of, yaml_of
+from mvrecon.core.files.checks import (
+    MAX_YAML_BYTES,
+    Refused,
+    file_in,
+    from_home,
+    text_of,
+    yaml_of,
+)
 from mvrecon.core.options import with_paths
 from mvrecon.core.quantities import INSIDE_MARK
 from mvrecon.core.registry import hint
@@ -48,8 +55,8 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
 
 
 def _from_folder(folder: Path, path: str) -> str:
-    """A path of a file, or of a data set as <file>:<name>, relative to a folder; the name of a data
-    set alone, which is no file, as it was typed.
+    """A path as it begins in a folder: of a file, or of a data set as <file>:<name>; the name of a
+    data set alone, which is no file, as it was typed.
     """
     whole, (head, sign, name) = from_home(path), str(path).rpartition(":")
     if not whole.exists() and not sign:

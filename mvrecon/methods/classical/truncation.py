@@ -122,8 +122,8 @@ def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
     edges = edges.flatten(0, 1)
     top = edges.split(PARTS, dim=-2)[3].amax(dim=(1, 2, 3))[:, None, None]
     ends, *_, noise = _grouped(edges).split(PARTS, dim=-2)
-    noise = noise / math.sqrt(edges.shape[1] // len(noise))
-    # an estimate from sixteen pixels is somewhere half the noise by chance
+    noise = noise / math.sqrt(_per_group(edges))
+    # that of sixteen pixels is half as much by chance somewhere
     noise = torch.maximum(noise, noise.movedim(1, 0).flatten(1).median(dim=1).values[:, None, None])
     lowest = ends.amin(dim=(0, 2, 3))[:, None, None]
     air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
@@ -131,9 +131,14 @@ def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
 
 
 def _grouped(x: Float[Tensor, "k m n i"]) -> Float[Tensor, "g k n i"]:
-    """Means over at most `VIEW_GROUPS` groups of consecutive views."""
+    """Means over groups of consecutive views."""
     parts = x.tensor_split(min(VIEW_GROUPS, x.shape[1]), dim=1)
     return torch.stack([part.mean(dim=1) for part in parts])
+
+
+def _per_group(edges: Float[Tensor, "k m n i"]) -> int:
+    """The least number of views in a group."""
+    return edges.shape[1] // min(VIEW_GROUPS, edges.shape[1])
 
 
 def truncated(edges: Float[Tensor, "b c k 10 i"]) -> Bool[Tensor, "b c k 1 1"]:
@@ -240,7 +245,7 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     most, top = (_grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
     known, beside = (torch.where(seen > 0, x, torch.nan) for x in (ends, nexts))
     sure, possible = _air(known, beside, top)
-    noise = _grouped(noise) / math.sqrt(edges.shape[1] // len(seen))
+    noise = _grouped(noise) / math.sqrt(_per_group(edges))
 
     def cut_beyond(air: Float[Tensor, "k n 1"]) -> Bool[Tensor, "g k i"]:
         return (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)

@@ -225,6 +225,41 @@ def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
     return _least_squares(_powers(t, terms), values)
 
 
+def _read_table(path: Path, cameras: Cameras) -> dict[str, Float[Tensor, " n"]]:
+    """The columns of a table of a measured response, with `distance_mm`; see `measured`.
+
+    Raises:
+        ValueError: missing or unknown columns, impossible values, or several distances.
+    """
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = set(rows[0]) if rows else set()
+    if not set(TABLE) <= names <= {*TABLE, *OPTIONAL}:
+        known, got = ", ".join((*TABLE, *OPTIONAL)), ", ".join(sorted(names))
+        raise ValueError(f"{path}: expected a table of {known}, got {got}")
+    try:
+        columns = {
+            name: torch.tensor([float(row[name]) for row in rows], dtype=torch.float64)
+            for name in names
+        }
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected numbers in all columns, got {error}") from error
+    if "distance_mm" not in names:
+        lengths = cameras.distance.detach()
+        if (lengths - lengths[0]).abs().max() > 1e-3 * lengths[0]:
+            raise ValueError(
+                f"{path}: expected cameras with one distance from hole to detector, or distance_mm "
+                f"in the table"
+            )
+        columns["distance_mm"] = lengths[0].expand(len(rows))
+    finite = all(column.isfinite().all() for column in columns.values())
+    in_mm = [name for name in (*TABLE, "distance_mm") if name.endswith("mm")]
+    positive = all((columns[name] > 0).all() for name in in_mm)
+    if not (finite and positive and (columns["angle_degrees"].abs() < 90).all()):
+        raise ValueError(f"{path}: expected finite, positive mm, and angles below 90 degrees")
+    return columns
+
+
 def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
     """A response from widths of the images of point sources, of Gaussian shape.
 
@@ -291,41 +326,6 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
         radial=tuple(smear.tolist()),
         efficiency=tuple(efficiency.tolist()),
     )
-
-
-def _read_table(path: Path, cameras: Cameras) -> dict[str, Float[Tensor, " n"]]:
-    """The columns of a table of a measured response, with `distance_mm`; see `measured`.
-
-    Raises:
-        ValueError: missing or unknown columns, impossible values, or several distances.
-    """
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    names = set(rows[0]) if rows else set()
-    if not set(TABLE) <= names <= {*TABLE, *OPTIONAL}:
-        known, got = ", ".join((*TABLE, *OPTIONAL)), ", ".join(sorted(names))
-        raise ValueError(f"{path}: expected a table of {known}, got {got}")
-    try:
-        columns = {
-            name: torch.tensor([float(row[name]) for row in rows], dtype=torch.float64)
-            for name in names
-        }
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected numbers in all columns, got {error}") from error
-    if "distance_mm" not in names:
-        lengths = cameras.distance.detach()
-        if (lengths - lengths[0]).abs().max() > 1e-3 * lengths[0]:
-            raise ValueError(
-                f"{path}: expected cameras with one distance from hole to detector, or distance_mm "
-                f"in the table"
-            )
-        columns["distance_mm"] = lengths[0].expand(len(rows))
-    finite = all(column.isfinite().all() for column in columns.values())
-    in_mm = [name for name in (*TABLE, "distance_mm") if name.endswith("mm")]
-    positive = all((columns[name] > 0).all() for name in in_mm)
-    if not (finite and positive and (columns["angle_degrees"].abs() < 90).all()):
-        raise ValueError(f"{path}: expected finite, positive mm, and angles below 90 degrees")
-    return columns
 
 
 def _distinct(values: Float[Tensor, " n"], least: float) -> int:
