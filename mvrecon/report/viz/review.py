@@ -314,7 +314,7 @@ def planes(
     Values from 0 to the case's range; errors, volume - truth, to a fourth of it.
 
     Args:
-        case: its grid and range.
+        case: grid and range of the case.
         truth: the true values.
         volumes: volumes by name; further lines of a name, such as figures, are printed below it.
         marked: the truth with a support's outline, drawn instead.

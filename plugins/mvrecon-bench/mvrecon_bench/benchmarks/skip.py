@@ -50,7 +50,7 @@ class Bed:
 
     Args:
         volume: the volume, on its device.
-        grid: its grid.
+        grid: grid of the volume.
         cameras: the rig.
         method: method of the projector.
         support: the voxels that may be nonzero; None: the nonzero voxels.

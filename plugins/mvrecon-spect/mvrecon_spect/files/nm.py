@@ -288,7 +288,7 @@ def frame_numbers(image: DicomImage, name: str) -> list[int]:
         values = [int(v) for v in np.atleast_1d(value)]
     if len(values) != frames or min(values) < 1:
         raise Refused(
-            f"{image.path}: expected {name} of {frames} numbers from 1 on, one a frame, got "
+            f"{image.path}: expected {name} of {frames} numbers from 1 on, one per frame, got "
             f"{len(values)}"
         )
     return values

@@ -46,9 +46,9 @@ class Shared(TypedDict, total=False):
             crystal, or the path of a table, see `response_of`.
         method: "footprints" of voxels, see `Footprints`; or "joseph": the thin ray of each pixel's
             centre, see `Drr`, for plain views of fine voxels and lists of bins.
-        backend: as in `RayTransform`.
-        skip: as in `RayTransform`; only with thin rays.
-        support: as in `RayTransform`.
+        backend: see `RayTransform`.
+        skip: see `RayTransform`; only with thin rays.
+        support: see `RayTransform`.
         collimator_mu: linear attenuation of the collimator in 1/mm, see `Hole`.
         opening_degrees: full opening angle of the edge, see `Hole`.
         acceptance_degrees: maximum angle of a ray to the pinhole's axis, see `Hole`.
