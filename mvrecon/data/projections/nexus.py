@@ -339,21 +339,7 @@ class _Layout(NamedTuple):
         folder = scan.parent.resolve()
         frames = Frames(self.frames, folder)
         check_order(self.frames, self.axes, FRAMES)
-        keys = np.zeros(frames.shape[0], int)
-        if self.key is not None and self.sinogram:
-            raise Refused(f"{self.key}: expected no keys of sinograms, got some")
-        if self.key is not None:
-            keys = values_at(self.key, EXPECTED)
-            if keys.shape != (frames.shape[0],):
-                raise Refused(
-                    f"{self.key}: expected a key for each of {frames.shape[0]} frames, got "
-                    f"{keys.shape}"
-                )
-            if unknown := sorted({*keys.tolist()} - {VIEW, FLAT, DARK, INVALID, ALIGNMENT}):
-                raise Refused(
-                    f"{self.key}: expected keys 0 (views), 1 (flat), 2 (dark), 3 (invalid) or -1 "
-                    f"(alignment), got {shown(unknown)}"
-                )
+        keys = self._keys(frames.shape[0])
         lengths = [place for pair in self.pixel for place in pair]
         monitors = [place for _, place in (*self.exposures, *self.flats)]
         units = texts_at([*lengths, *monitors], "units", EXPECTED)
@@ -384,10 +370,36 @@ class _Layout(NamedTuple):
             rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW, EXPECTED)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
+        self._warn_of_moves(keys, pixel)
+        return FrameViews(
+            frames, views, fields, rig, scan, stated, *limits_of(self.detector, frames, keys)
+        )
+
+    def _keys(self, count: int) -> np.ndarray:
+        """The image_key of each of so many frames; all are views without one."""
+        if self.key is None:
+            return np.zeros(count, int)
+        if self.sinogram:
+            raise Refused(f"{self.key}: expected no keys of sinograms, got some")
+        keys = values_at(self.key, EXPECTED)
+        if keys.shape != (count,):
+            raise Refused(
+                f"{self.key}: expected a key for each of {count} frames, got {keys.shape}"
+            )
+        if unknown := sorted({*keys.tolist()} - {VIEW, FLAT, DARK, INVALID, ALIGNMENT}):
+            raise Refused(
+                f"{self.key}: expected keys 0 (views), 1 (flat), 2 (dark), 3 (invalid) or -1 "
+                f"(alignment), got {shown(unknown)}"
+            )
+        return keys
+
+    def _warn_of_moves(self, keys: np.ndarray, pixel: tuple[float, float] | None) -> None:
+        """Warn of translations of the sample between views, by more than a part of a pixel."""
         below = nexus_axes.translations_below(self.angles, EXPECTED) if self.angles else ()
         for place in dict.fromkeys((*self.moves, *below)):
             moved = values_at(place, EXPECTED, ("units", *nexus_axes.ATTRIBUTES)).ravel()
-            far = np.ptp(moved[views]) if len(moved) == len(keys) and len(views) else 0
+            views = moved[keys == VIEW] if len(moved) == len(keys) else moved[:0]
+            far = np.ptp(views) if len(views) else 0
             unit = texts_at([place], "units", EXPECTED).get(place)
             if far and not (
                 pixel and unit and far * millimetres(place, unit) < MAX_MOVE_PX * min(pixel)
@@ -395,11 +407,8 @@ class _Layout(NamedTuple):
                 warnings.warn(
                     f"{place}: the sample moved by {far:g}{f' {unit}' if unit else ''} between "
                     f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
-                    stacklevel=2,
+                    stacklevel=3,
                 )
-        return FrameViews(
-            frames, views, fields, rig, scan, stated, *limits_of(self.detector, frames, keys)
-        )
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
         """Pixel size (v, u) in mm; None if the file has none with units."""
