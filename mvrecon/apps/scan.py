@@ -268,13 +268,7 @@ def open_scan(
             f"{projector['name']!r}, which makes line integrals"
         )
     if measured.stack.attenuated and projector.get("mu") is None:
-        name, mu = (unit or "").partition(" of ")[0], Path(measured.options.path).with_name(MU_FILE)
-        value = mu if mu.is_file() else "<that of the simulation>"
-        warnings.warn(
-            f"{measured.options.path}: expected projector={name} projector.mu={value} for "
-            f"attenuated counts, got no projector.mu; without it the activity is too low",
-            stacklevel=2,
-        )
+        _warn_of_missing_mu(measured)
     if scatter is not None:
         scan = replace(scan, scatter=_scatter(scan, scatter))
     absolute = None
@@ -297,6 +291,18 @@ def share_beside(A: LinearOperator, views: Float[Tensor, "1 1 m v u"]) -> float:
     reached = A(torch.ones(1, 1, *A.domain_shape, device=A.device)).to(views) > 0
     whole = views.sum(dtype=torch.float64).item()
     return (views * ~reached).sum(dtype=torch.float64).item() / whole if whole > 0 else 0.0
+
+
+def _warn_of_missing_mu(views: MeasuredViews) -> None:
+    """Warn of attenuated counts without an attenuation map."""
+    path, name = Path(views.options.path), (views.stack.unit or "").partition(" of ")[0]
+    mu = path.with_name(MU_FILE)
+    value = mu if mu.is_file() else "<that of the simulation>"
+    warnings.warn(
+        f"{views.options.path}: expected projector={name} projector.mu={value} for attenuated "
+        f"counts, got no projector.mu; without it the activity is too low",
+        stacklevel=3,
+    )
 
 
 def _scatter(scan: Scan, scatter: ScatterPart) -> Float[Tensor, "1 1 m v u"]:
