@@ -13,13 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.apps.progress import Bar
-from mvrecon.apps.scan import Scan, ViewsInMemory, field_box, share_beside
+from mvrecon.apps.scan import Scan, ViewsInMemory, share_beside
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
 from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import resolution
+from mvrecon.geometry.cameras.field import extended_to_field, resolution
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.geometry.rigid import unit
@@ -143,7 +143,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     axis = conjugate_axis(scan.cameras, pixels, box) if "offset_u" in free else KEPT
     about = scan.cameras.shifted(torch.tensor([[axis.offset, 0.0]]))
     if share_beside(operator_of(coarse(box, MAX_GRID_VOXELS), about), pixels) > MAX_BESIDE:
-        box = field_box(about, box)
+        box = extended_to_field(about, box)
     box = _grown(box) if cut.all(dim=-1).any() else box
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)

@@ -54,9 +54,9 @@ def evaluate(options: EvalSettings, folder: Path) -> Results:
     device = device_of(options.device)
     run = folder_of_run(options.checkpoint)
     described = (label for label, model in (options.compare or {}).items() if model)
-    if trained := [label for label in described if checkpoints.finished(run, label).exists()]:
+    if taken := [label for label in described if checkpoints.finished(run, label).exists()]:
         raise ValueError(
-            f"compare describes {trained}, which the run has trained already; expected other labels"
+            f"compare describes {taken}, which the run has trained already; expected other labels"
         )
     trained = run_folder.read_settings(run)
     settings = merged(trained, options)

@@ -80,7 +80,7 @@ class Output:
         return output
 
     def for_scan(self, scan: Scan) -> "Output":
-        """The same in the unit of a scan, if the volume's file can hold it.
+        """The output in the unit of a scan, if the volume's file can hold it.
 
         Raises:
             ValueError: Hounsfield units for other than attenuation; what the file cannot hold.

@@ -144,7 +144,7 @@ def reconstruct(
         scan: the views as measured.
         method: the method that reconstructs them.
         output: files to write.
-        corrections: those made before the reconstruction.
+        corrections: corrections before the reconstruction.
         settings: settings of the run; `left_out`: also predict each view from all others, by one
             more reconstruction each.
         device: device to compute on.
@@ -235,9 +235,9 @@ def save_calibration(
 
     Args:
         nominal: the scan before the calibration.
-        fitted: its cameras after it.
+        fitted: the scan's cameras after it.
         free: parameters that were fitted.
-        grid: its settings.
+        grid: settings of the scan's grid.
         output: files to write.
 
     Raises:
@@ -372,56 +372,62 @@ def report(table: dict[str, Any], folder: Path) -> None:
     from rich.console import Console
 
     from mvrecon.apps.progress import logger
-    from mvrecon.apps.scan import EMISSION
-    from mvrecon.data.attenuation import CONCENTRATION, WATER
-    from mvrecon.report.cameras import disturbed_cameras, little_weight
 
-    lines, peak = [], table["peak_bytes"]
-    if logger.isEnabledFor(logging.INFO):
-        memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
-        low, high = table["percentiles_1_99"]
-        about = {
-            "HU": " (water: 0)",
-            "1/mm": f" (water: {WATER})",
-            EMISSION: " (relative; factors with branching give kBq/ml)",
-            CONCENTRATION: f"; {table.get('total_mbq') or 0:.4g} MBq in the grid",
-        }.get(table["unit"], "")
-        if fit := table.get("calibration"):
-            lines.append(f"calibrate: {fit['words']}; {fit['scan'] or fit['cameras']}")
-        for number, shift in enumerate(table.get("shifts", {}).get("shift_mm", ())):
-            if number:
-                sigma = table["shifts"]["sigma_mm"][number]
-                axes = zip("xyz", shift, sigma, strict=True)
-                words = ", ".join(f"{axis} {t:+.2f} +- {s:.2f}" for axis, t, s in axes)
-                lines.append(f"shift of joint.{number - 1}: {words} mm")
-        if polynomial := table.get("linearisation"):
-            numbers = ",".join(f"{c:.6g}" for c in polynomial["coefficients"])
-            lines.append(
-                f"views.linearise=[{numbers}]: fitted to the views, for other scans of this beam; "
-                f"the object is {polynomial['value']:.4g}/mm, {polynomial['residual']:.2%} of its "
-                f"line integrals are left"
-            )
-        compared, count = table["compared_views"], table["views"]["count"]
-        of = "" if compared in (None, count) else f" of {compared} of {count} views"
-        lines += [
-            f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
-            f"{table['view_nrmse']:.3g}{of}; {table['volume']}; pictures in {folder}",
-            f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{about}",
-        ]
-        if sensitivity := table.get("sensitivity_cps_per_mbq"):
-            lines.append(
-                f"sensitivity: {sensitivity:.4g} cps/MBq at the centre of the grid, all views at "
-                f"once, one photon a decay"
-            )
-        lines += [
-            *disturbed_cameras(table.get("cameras")),
-            *little_weight(table["camera_weights"]),
-        ]
+    lines = _figures(table, folder) if logger.isEnabledFor(logging.INFO) else []
     if table["stopped"] is not None:
         lines.append(f"Ctrl-C: the volume is that of iteration {table['stopped']}")
     lines += [f"sanity check: {words}" for words in table["sanity_checks"]]
     for line in lines:
         Console(markup=False, highlight=False).print(line, soft_wrap=True)
+
+
+def _figures(table: dict[str, Any], folder: Path) -> list[str]:
+    """The results of a run in lines of text: estimates, time and residual, values, cameras."""
+    from mvrecon.apps.scan import EMISSION
+    from mvrecon.data.attenuation import CONCENTRATION, WATER
+    from mvrecon.report.cameras import disturbed_cameras, little_weight
+
+    lines, peak = [], table["peak_bytes"]
+    memory = "" if peak is None else f", {peak / 2**30:.2f} GiB at most"
+    low, high = table["percentiles_1_99"]
+    about = {
+        "HU": " (water: 0)",
+        "1/mm": f" (water: {WATER})",
+        EMISSION: " (relative; factors with branching give kBq/ml)",
+        CONCENTRATION: f"; {table.get('total_mbq') or 0:.4g} MBq in the grid",
+    }.get(table["unit"], "")
+    if fit := table.get("calibration"):
+        lines.append(f"calibrate: {fit['words']}; {fit['scan'] or fit['cameras']}")
+    if shifts := table.get("shifts"):
+        pairs = zip(shifts["shift_mm"], shifts["sigma_mm"], strict=True)
+        for number, (shift, sigma) in [*enumerate(pairs)][1:]:
+            axes = zip("xyz", shift, sigma, strict=True)
+            words = ", ".join(f"{axis} {t:+.2f} +- {s:.2f}" for axis, t, s in axes)
+            lines.append(f"shift of joint.{number - 1}: {words} mm")
+    if polynomial := table.get("linearisation"):
+        numbers = ",".join(f"{c:.6g}" for c in polynomial["coefficients"])
+        lines.append(
+            f"views.linearise=[{numbers}]: fitted to the views, for other scans of this beam; "
+            f"the object is {polynomial['value']:.4g}/mm, {polynomial['residual']:.2%} of its "
+            f"line integrals are left"
+        )
+    compared, count = table["compared_views"], table["views"]["count"]
+    of = "" if compared in (None, count) else f" of {compared} of {count} views"
+    lines += [
+        f"{table['method']}: {table['seconds']:.2f} s{memory}, view NRMSE "
+        f"{table['view_nrmse']:.3g}{of}; {table['volume']}; pictures in {folder}",
+        f"values: 1st to 99th percentile {low:.3g} to {high:.3g} {table['unit']}{about}",
+    ]
+    if sensitivity := table.get("sensitivity_cps_per_mbq"):
+        lines.append(
+            f"sensitivity: {sensitivity:.4g} cps/MBq at the centre of the grid, all views at "
+            f"once, one photon per decay"
+        )
+    return [
+        *lines,
+        *disturbed_cameras(table.get("cameras")),
+        *little_weight(table["camera_weights"]),
+    ]
 
 
 def main() -> None:

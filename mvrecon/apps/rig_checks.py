@@ -15,12 +15,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.apps.scan import Scan, field_box
+from mvrecon.apps.scan import Scan
 from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import auto_grid, resolution
+from mvrecon.geometry.cameras.field import auto_grid, extended_to_field, resolution
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.classical.orbit import orbit_of
@@ -28,7 +28,7 @@ from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.classical.truncation import CUT_EDGE, edge_shares, ends_of
 from mvrecon.operators.operator import Scaled
 
-#: Size of the field relative to the grid's from which on a grid holds a part of the object.
+#: Size of the field, relative to a grid's, from which on the grid is only a part of the object.
 FAR_LARGER = 2.0
 #: Voxels along the longest side of a slice and of a volume, and views.
 SLICE_VOXELS, VOLUME_VOXELS, MAX_VIEWS = 32, 24, 40
@@ -144,7 +144,7 @@ class Rig(NamedTuple):
         squares: squared norm of each view's residual after `SEARCH_ITERATIONS`, relative to that of
             all views.
         words: how the views fit this rig better, in words; empty for the stored one.
-        cure: what the user is asked.
+        cure: question that the warning asks the user.
         order: order of the views' axes, one of `ORDERS` or `STORED_ORDER`.
     """
 
@@ -167,9 +167,9 @@ class SomeViews(NamedTuple):
         scan: the scan, of line integrals.
         numbers: numbers of the views.
         first: the first view as it is stored.
-        region: the pixels that are joined to one.
-        cameras: stored ones of the coarse views.
-        grid: coarse, about as large as what the views show.
+        region: crop and binning from the detector to the coarse views.
+        cameras: the rig as stored, for the coarse views.
+        grid: coarse grid, about as large as what the views show.
         cut: whether views end inside the object at the first and the last row, and at the first and
             the last column: a half fan ends at one.
         views: blurred means of the measured pixels.
@@ -273,8 +273,8 @@ def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:
 
 
 def coarse_grid(scan: Scan) -> Grid:
-    """A coarse grid of the scan's box; of the field of half of the views if that is larger, and of
-    both if that is far larger along an axis, as of a slice.
+    """A coarse grid of the scan's box; instead, of the field of half of the views if that is larger
+    along all axes, or of both if the field is far larger along one, as of a slice.
     """
     box = scan.grid
     with suppress(ValueError):  # of a rig without a common field
@@ -284,7 +284,7 @@ def coarse_grid(scan: Scan) -> Grid:
         ]
         if all(a >= b * (1 - 1e-6) for a, b in zip(*sizes, strict=True)):
             box = field
-    whole = field_box(scan.cameras, box)
+    whole = extended_to_field(scan.cameras, box)
     if any(n >= FAR_LARGER * own for n, own in zip(whole.size, box.size, strict=True)):
         box = whole
     return coarse(box, SLICE_VOXELS if 1 in box.shape else VOLUME_VOXELS)

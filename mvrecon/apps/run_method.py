@@ -85,7 +85,7 @@ class Method:
     """A method with the rules that end it.
 
     Args:
-        name: its name.
+        name: name of the method.
         module: method f(views, A).
         stop_sigma: standard deviation of the line integrals' noise: an iterative method stops
             where it explains the residual; None: no such rule.
@@ -118,7 +118,7 @@ class Method:
 
         Args:
             method: name and options.
-            stop_sigma, choose: as in the class.
+            stop_sigma, choose: see `Method`.
 
         Raises:
             LookupError, TypeError: no such method, or no such option of it.

@@ -44,7 +44,8 @@ MAX_NRMSE_TO_NOISE = 1.25
 #: A method needs more views where it leaves at least this part of the residual of consistent ones,
 #: and twice as much as of so many times as many.
 MIN_SPARSE_SHARE, DENSER_FACTOR = 0.5, 4
-#: Share of the line integrals beside the grid from which on they tell why it explains no views.
+#: Share of the line integrals whose rays miss the grid, from which on the grid is too small to
+#: explain the views.
 MIN_BESIDE = 0.1
 #: An iterative method has not converged where a coarse SIRT explains the views and leaves less than
 #: this part of what it leaves.
@@ -70,7 +71,7 @@ def sanity_checks(
     Args:
         scan: the scan that was reconstructed.
         method: name of the method.
-        outcome: its volume, in the unit of the views per mm.
+        outcome: what the method made, with a volume in the unit of the views per mm.
         device: device that computes the comparison.
         as_read: the views before a correction, which leaves no whole counts; None: the scan's.
     """
@@ -110,7 +111,7 @@ def sanity_checks(
         elif noise is not None:
             words += _of_hot_voxels(outcome.volume)
     beside = _beside(seen) if seen and view_nrmse > limit else 0.0
-    # a part of the object explains no views, but filtered back-projection reads it right
+    # filtered back-projection is right on a grid of a part of the object, which explains no views
     part = beside > MIN_BESIDE and METHODS.get(method) in (fbp, fdk)
     if view_nrmse > limit and not words and not part:
         cause = _cause(seen, method, view_nrmse, beside) if seen and kind != "counts" else ""

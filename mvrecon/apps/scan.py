@@ -86,12 +86,12 @@ class Scan:
 
     Args:
         measured: views, read from disk on access.
-        cameras: one for each view.
+        cameras: cameras of the views, one for each.
         grid: the voxels to reconstruct.
         projector: name and options of the operator.
         unit: unit of the volume.
         counts: whether the views are counts of emission.
-        scatter: expected in these counts, in the views' unit; None: none.
+        scatter: scatter expected in these counts, in the views' unit; None: none.
         dose: counts per unit of the views, which were divided by it.
         factors: factor of each pixel, such as its uniformity; None: one.
         rig: the cameras of all views on disk, before choice, crop and binning; None: unknown.
@@ -149,9 +149,9 @@ class GridOfScan:
     all views see, of a half fan what they measure together.
 
     Args:
-        size: voxels, one number or (x, y, z).
-        spacing: mm, one number or (x, y, z).
-        centre: mm.
+        size: number of voxels, one number or (x, y, z).
+        spacing: voxel size in mm, one number or (x, y, z).
+        centre: centre of the grid in world mm.
         like: a volume file: reconstructs on its voxels, and writes them in its order of axes.
         seen_by: share of the views, such as 0.5: reconstructs what so many of them see.
 
@@ -219,14 +219,14 @@ def open_scan(
     """Open a scan.
 
     Args:
-        views: their files and corrections; rows are reversed if the camera's file counts them
-            upwards (`flip_rows`).
-        camera: name and options; what is not set is that of the views on disk, see
-            `stated_rig.completed`.
+        views: files and corrections of the views; rows are reversed if the camera's file counts
+            them upwards (`flip_rows`).
+        camera: name and options of the rig; options that are not set are those that the files of
+            the views state, see `stated_rig.completed`.
         grid: f(cameras) -> the voxels to reconstruct, see `grid_of`.
-        projector: name and options; drr of parallel beams is radon.
-        scatter: name and options of its estimate, whose files are read with the options of the
-            views; None: no scatter.
+        projector: name and options of the projector; drr of parallel beams is radon.
+        scatter: name and options of the scatter's estimate, whose files are read with the options
+            of the views; None: no scatter.
         factors: name and options of the factors of counts; None: one.
 
     Warns:
@@ -268,16 +268,7 @@ def open_scan(
             f"{projector['name']!r}, which makes line integrals"
         )
     if measured.stack.attenuated and projector.get("mu") is None:
-        mu, (name, _, _) = (
-            Path(measured.options.path).with_name(MU_FILE),
-            (unit or "").partition(" of "),
-        )
-        value = mu if mu.is_file() else "<that of the simulation>"
-        warnings.warn(
-            f"{measured.options.path}: expected projector={name} projector.mu={value} for "
-            f"attenuated counts, got no projector.mu; without it the activity is too low",
-            stacklevel=2,
-        )
+        _warn_of_missing_mu(measured)
     if scatter is not None:
         scan = replace(scan, scatter=_scatter(scan, scatter))
     absolute = None
@@ -295,30 +286,23 @@ def open_scan(
     return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
 
 
-def field_box(cameras: Cameras, grid: Grid) -> Grid:
-    """A grid with more voxels where its box ends inside the field of half of the views, by more
-    than a half of a pixel's image; the grid itself where there is no such field.
-    """
-    try:
-        field = auto_grid(cameras, seen_by=0.5)
-    except ValueError:  # of a rig without a common field
-        return grid
-    low, high = grid.to_index(field.corners()).aminmax(dim=0)
-    slack = max(field.spacing) / 2 / low.new_tensor(grid.spacing)
-    before = (-0.5 - slack - low).ceil().clamp_min(0)
-    behind = (high - low.new_tensor(grid.size) + 0.5 - slack).ceil().clamp_min(0)
-    affine = grid.affine.clone()
-    affine[:3, 3] = grid.to_world(-before)
-    more = (before + behind).long().tolist()
-    x, y, z = (n + k for n, k in zip(grid.size, more, strict=True))
-    return Grid((z, y, x), affine)
-
-
 def share_beside(A: LinearOperator, views: Float[Tensor, "1 1 m v u"]) -> float:
     """The share of the line integrals in pixels whose rays miss an operator's grid, up to noise."""
     reached = A(torch.ones(1, 1, *A.domain_shape, device=A.device)).to(views) > 0
     whole = views.sum(dtype=torch.float64).item()
     return (views * ~reached).sum(dtype=torch.float64).item() / whole if whole > 0 else 0.0
+
+
+def _warn_of_missing_mu(views: MeasuredViews) -> None:
+    """Warn of attenuated counts without an attenuation map."""
+    path, name = Path(views.options.path), (views.stack.unit or "").partition(" of ")[0]
+    mu = path.with_name(MU_FILE)
+    value = mu if mu.is_file() else "<that of the simulation>"
+    warnings.warn(
+        f"{views.options.path}: expected projector={name} projector.mu={value} for attenuated "
+        f"counts, got no projector.mu; without it the activity is too low",
+        stacklevel=3,
+    )
 
 
 def _scatter(scan: Scan, scatter: ScatterPart) -> Float[Tensor, "1 1 m v u"]:
@@ -340,9 +324,9 @@ def _read(
     Args:
         views: views of the scan.
         path: path of the file.
-        relative: any values, also of an unknown dose, as they are.
-        widths_kev: they are those of an energy window of this width, of the scan's of the second
-            width; None: unknown.
+        relative: return the values as they are, whatever their dose and duration.
+        widths_kev: widths of the file's energy window and of the scan's, each None if unknown;
+            None: of no other window.
 
     Raises:
         Refused: other sizes, an unknown dose, another width than a file states, or the window of

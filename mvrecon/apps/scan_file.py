@@ -35,11 +35,11 @@ from mvrecon.core.registry import hint
 NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
-#: Options that are a text of any characters, but those that control a terminal.
+#: Options whose texts may have any characters except control characters.
 TEXTS = ("views.pattern", "views.dataset")
 #: Values: numbers, words, products of names or patterns of them, and paths; nothing that refers.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
-#: Numbers without a point or the sign of their exponent, which are texts in YAML.
+#: Numbers that YAML 1.1 reads as texts, as they have no point or no sign of the exponent.
 NUMBER = re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+")
 #: Beginnings of texts that name a file, not a data set of the scan's own.
 FILE = re.compile(r"[.~]|[^:]*:")
@@ -101,8 +101,8 @@ def expanded(arguments: Sequence[str]) -> list[str]:
 
 
 def _found(place: Path) -> Path:
-    """The file: itself, in a folder, that of the only calibration there, or that of the only case
-    of a simulation.
+    """The description at a place: a file, or in a folder its own, that of its only calibration, or
+    that of the only case of a simulation.
     """
     if place.is_file():
         return place

@@ -74,9 +74,9 @@ class Further(TypedDict, total=False):
     Args:
         views: options of its views, such as another path or dataset.
         camera: options of its rig.
-        projector: such as mu and intrinsic_mm at its energy.
+        projector: options of the projector, such as mu and intrinsic_mm at its energy.
         scatter: scatter in its counts.
-        factors: such as branching at its energy, or time_s of a frame.
+        factors: options of the factors, such as branching at its energy, or time_s of a frame.
     """
 
     views: ViewsOptions

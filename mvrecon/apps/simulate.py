@@ -23,7 +23,7 @@ BYTES_PER_VALUE = 4
 
 
 def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
-    """Measure every case of `settings` and return their folders, one a case in `<folder>/cases`.
+    """Measure every case of `settings` and return the cases' folders in `<folder>/cases`.
 
     A case has its views as `views.h5` (counts with dose and duration) and images, its truth on the
     grid as `truth.nii.gz` (in HU if the scene is in 1/mm), the attenuation of an emitting scene

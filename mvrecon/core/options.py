@@ -285,7 +285,7 @@ def with_paths(value: Any, type: Any, change: Callable[[str, tuple], str | Path]
     Args:
         value: data to be copied.
         type: its type.
-        change: f(path, what it is annotated with), such as `WEIGHTS_MARK`.
+        change: f(path, marks): the path in its place; marks annotate its type, as `WEIGHTS_MARK`.
     """
 
     def changed(value: Any, type: Any) -> Any:

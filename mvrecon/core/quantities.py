@@ -21,7 +21,7 @@ Triple: TypeAlias = Annotated[Sequence[T], Len(3, 3)]
 
 #: Marks a path that may also be the name of weights that mvrecon ships.
 WEIGHTS_MARK = "weights"
-#: Marks a path that is the name of a data set in the scan's own file unless it is that of a file.
+#: Marks a path that may also be the name of a data set in the scan's file.
 INSIDE_MARK = "inside"
 #: A path of weights, or their name.
 WeightsFile: TypeAlias = Annotated[str | Path, WEIGHTS_MARK]

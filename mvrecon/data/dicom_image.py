@@ -171,7 +171,7 @@ class DicomImage:
         """All values of an attribute that are not empty, each with its place in words.
 
         Args:
-            name: such as RescaleSlope.
+            name: name of the attribute, such as RescaleSlope.
             frame: number of a frame, for the values of this frame alone: the image's, the shared
                 and its own; None: those of all.
         """

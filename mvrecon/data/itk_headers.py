@@ -87,9 +87,9 @@ META_TYPES = {
     **{"MET_UCHAR": "u1", "MET_USHORT": "u2", "MET_UINT": "u4", "MET_ULONG": "u4"},
     **{"MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4", "MET_DOUBLE": "f8"},
 }
-#: Cosine of the angle up to which an oblique axis may be named by another side than the nearest, as
-#: ITK does where two axes are near one side.
-NAMED = 0.25
+#: Least cosine between an oblique axis and the side that names it, which need not be the nearest:
+#: where two axes are near one side, ITK names only one of them by it.
+MIN_SIDE_COSINE = 0.25
 #: The truth by the first letters that ITK accepts.
 TRUTH = {"true": True, "t": True, "1": True, "false": False, "f": False, "0": False}
 #: Fields of NRRD, all applied by ITK but where noted. A key/value pair (key:=value) is no field.
@@ -301,9 +301,10 @@ def _check_axes(path: Path, entries: Mapping[str, str], numbers: Mapping[str, An
     name = entries.get("AnatomicalOrientation", "").upper()
     if not re.fullmatch("[RLAPIS]{3}", name):
         return
-    pairs = [divmod("LRPASI".index(side), 2) for side in name]
-    along = np.array([axes[n, k] * (1 - 2 * away) for n, (k, away) in enumerate(pairs)])
-    if len({k for k, _ in pairs}) == 3 and (min(along) > NAMED or max(along) < -NAMED):
+    named = [divmod("LRPASI".index(side), 2) for side in name]  # its axis in LPS, and the sign
+    cosines = [axes[n, k] * (1 - 2 * away) for n, (k, away) in enumerate(named)]
+    alike = min(cosines) > MIN_SIDE_COSINE or max(cosines) < -MIN_SIDE_COSINE
+    if alike and len({k for k, _ in named}) == 3:
         return
     largest = np.abs(axes).argmax(axis=1)
     sides = [("RL", "AP", "IS")[k][int(axes[n, k] > 0)] for n, k in enumerate(largest)]

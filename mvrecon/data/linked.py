@@ -58,7 +58,7 @@ def followed(
 
     Args:
         path: path of the file.
-        name: such as "/entry/data/data".
+        name: name in the file, such as "/entry/data/data".
         expected: what should be there, for messages.
         folder: other files must be in it, or below; None: that of `path`.
         links: the links that were followed before.
@@ -139,7 +139,7 @@ def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.nd
     Args:
         place: place of the data set.
         expected: what should be there, for messages.
-        known: its attributes that the caller applies.
+        known: attributes that the caller applies.
 
     Raises:
         Refused: not numbers, more than `MAX_VALUES`, damage, or an attribute that changes

@@ -1,5 +1,5 @@
 """Safe reading of foreign HDF5 files: data must be in the file itself, and no chunk may unpack to
-more bytes than declared. And writing of small ones.
+more bytes than declared; and atomic writing of HDF5 files that fit in memory.
 """
 
 import math
@@ -36,8 +36,8 @@ LIST_END = 1
 
 @contextmanager
 def written(path: Path) -> Iterator[h5py.File]:
-    """Context of a new HDF5 file, made in memory and then written at once, atomically: libhdf5 does
-    not close a file for which a disk has no space, and crashes when the process ends.
+    """Context of a new HDF5 file, which is made in memory and then written at once, atomically:
+    libhdf5 crashes at the end of the process if a disk has no space for an open file.
 
     Raises:
         OSError: no space, no permission; the message names `path`.

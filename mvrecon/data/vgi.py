@@ -182,7 +182,7 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
     def passes() -> Iterator[Slab]:
         step = planes(y * x)
         with file_errors(data, "cannot be read"), data.open("rb") as file:
-            file.seek(skip)  # a map of memory would end the process if the file were cut short
+            file.seek(skip)  # no memory map: a file cut short meanwhile would end the process
             for first in range(0, z, step):
                 shape = (min(step, z - first), y, x)
                 values = np.fromfile(file, dtype, math.prod(shape)).reshape(shape)

@@ -201,7 +201,7 @@ def reconstruct(
         views: line integrals.
         cameras: the rig that measured them.
         grid: grid of the volume.
-        method: its name; `mvrecon-list method` lists all, with their options.
+        method: name of the method; `mvrecon-list method` lists all, with their options.
         options: options of the method.
 
     Returns:

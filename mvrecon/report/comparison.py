@@ -39,7 +39,7 @@ class Row:
 
     Args:
         run: name of the run, its differences from the others.
-        method: its label in the run.
+        method: label of the method in the run.
         scenes: names of the test scenes, a patient each.
         truths: mean and root mean square of each true volume; empty in tables of earlier versions.
         measured: settings of the test scenes and the grid.

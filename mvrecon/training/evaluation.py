@@ -137,7 +137,7 @@ class Loaded:
     """What a run is evaluated with.
 
     Args:
-        trained: its methods, by label.
+        trained: methods of the run by label.
         A: operator of the views.
         assumed: operators, by label, of methods that assume another one.
     """

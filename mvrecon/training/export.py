@@ -151,8 +151,8 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
     """Write the views of one case as a detector's grey values in `projections`: 16-bit TIFF with
     dark and flat field.
 
-    Convention: RTK's; the first row is the lowest one, opposite to `views`. Those of an interrupted
-    run are replaced image by image, so that each is whole, and other files stay.
+    Convention: RTK's; the first row is the lowest one, opposite to `views`. Images of an earlier
+    run are replaced one by one, so that each is whole at any time; other files stay.
 
     Args:
         folder: folder of all cases.

@@ -111,7 +111,7 @@ class NanGuard:
     GPU, where a check synchronises.
 
     Args:
-        method: its name, for the error.
+        method: name of the method, for the error.
     """
 
     def __init__(self, method: str):

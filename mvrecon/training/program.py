@@ -72,9 +72,9 @@ def save_program(
     The archive's `extra/load.py` has the import that must precede `torch.export.load`.
 
     Args:
-        run: as `path` of `mvrecon.load`.
+        run: see `path` of `mvrecon.load`.
         path: path of the file, which ends with .pt2; `torch.export.load` reads it.
-        method: its label in the run's table; None: the run's main method.
+        method: label of the method in the run's table; None: the run's main method.
         batch: number of samples per call.
 
     Returns:

@@ -117,8 +117,8 @@ class TrainSettings(Measurement):
         its name; then those of `compare` that are not null.
 
         Raises:
-            ValueError: a label that equals the main one's, differs from another only in case, is
-                "truth" or is the name of another's checkpoint, or is not a valid file name.
+            ValueError: a label that is the main one's or "truth", whose volume or checkpoint would
+                have the name of another's (in any case), or that is not a valid file name.
         """
         label = self.label or self.method["name"]
         others = {other: method for other, method in (self.compare or {}).items() if method}

@@ -117,7 +117,7 @@ class Trained:
             views: measured by the rig of the training, or by `cameras`.
             cameras: another rig; None: that of the training.
             grid: another grid of the volume; None: that of the training.
-            fallback: as in `reconstruct`.
+            fallback: see `reconstruct`.
 
         Warns:
             UserWarning: as `reconstruct`.
@@ -238,8 +238,8 @@ def load(path: str | Path, method: str | None = None) -> Trained:
     Args:
         path: path of a checkpoint, of weights (.safetensors) or of a run folder, whose setting
             `plugins` names modules to import; or the name of weights that are part of mvrecon.
-        method: its label in the run's table; None: the run's main method. Ignored for a checkpoint,
-            which holds one method.
+        method: label of the method in the run's table; None: the run's main method. Ignored for a
+            checkpoint, which holds one method.
 
     Returns:
         The method, which maps views to a volume, with the record of its training.
@@ -294,9 +294,9 @@ def save_weights(run: str | Path | Trained, path: str | Path, method: str | None
     `sha256`, that of the whole file with zeros in its place.
 
     Args:
-        run: as `path` of `load`, or its result.
+        run: see `path` of `load`, or its result.
         path: path of the file, which ends with .safetensors.
-        method: its label in the run's table; None: the run's main method.
+        method: label of the method in the run's table; None: the run's main method.
 
     Returns:
         The path of the file.
@@ -330,7 +330,7 @@ def begin_from(path: str | Path, module: ReconstructionModule) -> None:
     optimiser and schedule start anew.
 
     Args:
-        path: as in `load`: a run (its main method), a checkpoint or a weights file.
+        path: see `load`: a run (its main method), a checkpoint or a weights file.
         module: a module with the same method.
 
     Raises:

@@ -19,7 +19,7 @@ class TrainedMethod(nn.Module):
 
     Args:
         checkpoint: path of a checkpoint, of weights or of a run folder, or a name; see `load`.
-        method: its label in the run's table.
+        method: label of the method in the run's table.
         fallback: return the start where it predicts left-out views better, as in
             `Trained.reconstruct`.
 

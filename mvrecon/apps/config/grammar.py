@@ -38,7 +38,7 @@ class CommandLine:
     """What a user typed for Hydra.
 
     Args:
-        flags: such as `--cfg` and `job`.
+        flags: flags of Hydra, such as `--cfg` and `job`.
         overrides: changes in Hydra's grammar, without folders of configs.
         folders: folders of configs from elsewhere.
     """

@@ -193,8 +193,8 @@ def own_folder(config: DictConfig, sweeps: bool) -> list[str]:
     settings that it varies. Hydra's log file appears with its first message.
 
     Args:
-        config: composed, of a sweep from what it does not vary.
-        sweeps: whether it is of a sweep.
+        config: composed config; for a sweep, without the settings that it varies.
+        sweeps: whether the command line asks for a sweep.
 
     Raises:
         OSError: the folder cannot be made.
@@ -237,7 +237,7 @@ def run_once(task: Callable[[DictConfig], Any], config: DictConfig, app: str, co
     """Run a task with a plain config; `hydra.main` does the same, but composes it twice more.
 
     Args:
-        task: whose errors pass through Hydra.
+        task: function f(config), whose errors pass through Hydra.
         config: composed and checked config.
         app: name of the app and of its log file.
         conf: folder of mvrecon's configs.

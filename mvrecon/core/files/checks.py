@@ -59,7 +59,7 @@ def millimetres(where: object, unit: str) -> float:
 
     Args:
         where: source of the unit, for the message.
-        unit: such as "um", "Micron" or "micrometre".
+        unit: name of the unit, such as "um", "Micron" or "micrometre".
 
     Raises:
         Refused: an unknown unit.
@@ -73,7 +73,7 @@ def millimetres(where: object, unit: str) -> float:
 
 
 def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict") -> str:
-    """The UTF-8 text of a file, without the mark of its encoding that some programs put before it.
+    """The UTF-8 text of a file, without the byte order mark that some programs write before it.
 
     Args:
         path: path of the file.
@@ -162,8 +162,8 @@ def from_home(path: str | os.PathLike[str]) -> Path:
 
 
 def file_in(folder: Path, path: str) -> Path | None:
-    """A file as a path begins in a folder, or a data set as <file>:<name>; None of what is no file
-    there.
+    """The absolute path, from a folder, of a file or of a data set as <file>:<name>; None if there
+    is no such file.
     """
     head, sign, name = path.rpartition(":")
     if (whole := folder.absolute() / from_home(path)).exists():
@@ -218,10 +218,10 @@ def file_beside(header: Path, stated: str) -> Path:
 
 
 def check_link(path: Path) -> None:
-    """Check that a path is no link to what is not there, as of a file that was not fetched.
+    """Check that a path is no broken link, as a file that git-annex did not fetch.
 
     Raises:
-        FileNotFoundError: it is.
+        FileNotFoundError: a link whose target is missing.
     """
     if path.is_symlink() and not path.exists():
         raise FileNotFoundError(

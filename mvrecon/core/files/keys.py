@@ -56,7 +56,7 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
 def section_entries(path: str | Path) -> Iterator[tuple[str, str, str]]:
     """The entries of a text of sections, `[section]` and lines `name=value`: section with its
     brackets and name in lower case, and value; entries before the first section have "". Bytes that
-    are not UTF-8 are those of Latin-1, as in older programs of Windows.
+    are not UTF-8 are read as Latin-1, as older programs of Windows write them.
     """
     section, text = "", text_of(path, errors="surrogateescape")
     text = re.sub("[\udc80-\udcff]", lambda byte: chr(ord(byte[0]) - 0xDC00), text)

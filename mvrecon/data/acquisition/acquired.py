@@ -134,7 +134,7 @@ class Acquired(Scene):
         was projected; None for integrals in closed form.
 
         Args:
-            index, seed, grid: as in `sample`.
+            index, seed, grid: see `sample`.
             rig: the true cameras.
             amplitudes_mm: amplitude of the breathing object in each view, in mm; empty: at rest in
                 all.

@@ -85,16 +85,16 @@ THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
 
 def without_own_id(text: str) -> str:
-    """OME's description without the identifier of its own file: that of a set is one text, which is
-    read once.
+    """OME's description without the identifier of its own file, so that all files of a set have one
+    text, which is parsed once.
     """
     return OWN_ID.sub("", text, count=1)
 
 
 @lru_cache(maxsize=4)
 def images(text: str) -> list[str]:
-    """OME's description up to the first image, and from each one to the next; none of other
-    texts.
+    """OME's description in parts: up to the first image, and from each image to the next; no part
+    of other texts.
     """
     text = QUOTED.sub("", text)
     return re.split(r"<(?:\w+:)?Image\b", text) if OME.search(text) else []
@@ -102,15 +102,15 @@ def images(text: str) -> list[str]:
 
 @lru_cache(maxsize=32)
 def elements(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
-    """The elements of a name in OME's description: the number of the image, and the attributes."""
+    """The elements of a name in OME's description: the number of its image, and its attributes."""
     found = [re.findall(rf"<(?:\w+:)?{name}\b([^>]*)>", part) for part in images(text)]
     return [(n, dict(ATTRIBUTE.findall(one))) for n, part in enumerate(found) for one in part]
 
 
 @lru_cache(maxsize=4)
 def places_in_set(text: str) -> dict[str, list[PlaceInSet]]:
-    """Where OME places the pages of the files of a set, by the names of these; empty where it names
-    fewer than two files.
+    """The places of the pages of each file of a set, by the file's name, as OME's description
+    states them; empty where it names fewer than two files.
     """
     pages: dict[str, list[tuple[int, PlaceInSet]]] = {}
     sizes = dict(elements(text, "Pixels"))
@@ -166,6 +166,7 @@ def _planes(text: str) -> dict[PlaceInSet, list[dict[str, str]]]:
 
 
 def _place(number: int, attributes: Mapping[str, str], start: str) -> PlaceInSet:
+    """The place of an image by its attributes TheC .. or FirstC .."""
     return number, *(int(attributes.get(f"{start}{axis}", 0)) for axis in "CZT")
 
 
@@ -173,8 +174,8 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
     """The header of one page with what Micro-Manager and Dectris state of it.
 
     Args:
-        file: for messages.
-        head: by the tags of the page.
+        file: path of the file, for messages.
+        head: the header by the tags of the page.
         text: the description of the page.
         manager: metadata of Micro-Manager, None of others.
 
@@ -189,9 +190,16 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
                 head = head._replace(tops=_tops(file, "BitDepth", bits, head))
         if ms is not None:
             _add(stated, "ExposureTime", 0, milliseconds(file, ms, "ms"))
+    head = head._replace(stated=stated)
     entries = dict(LINE.findall(text)) if "#" in text else {}
-    if not {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
-        return head._replace(stated=stated)
+    if {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
+        return _of_dectris(file, head, entries)
+    return head
+
+
+def _of_dectris(file: Path, head: Header, entries: Mapping[str, str]) -> Header:
+    """The header of a page with the entries of a detector of Dectris, as texts by name."""
+    stated = {name: list(texts) for name, texts in head.stated.items()}
 
     def numbers(name: str, count: int = 1) -> tuple[list[float], str]:
         text = THOUSANDS.sub("", entries[name]) if name == "Count_cutoff" else entries[name]
@@ -212,9 +220,9 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
     if "Count_cutoff" in entries:
         with unneeded():
             ((top,), _) = numbers("Count_cutoff")
-            (of_type,) = head.tops  # which clips counts as well
-            least = min(top, of_type or top)
-            head = head._replace(tops=frozenset([least])) if top > 0 else head  # -1: none
+            if top > 0:  # -1: none
+                (of_type,) = head.tops  # which clips counts as well
+                head = head._replace(tops=frozenset([min(top, of_type or top)]))
     if "Pixel_size" in entries:
         with unneeded():
             (right, down), unit = numbers("Pixel_size", 2)
@@ -234,10 +242,10 @@ def of_file(
     """The header of all pages, in the order of the images, with what OME states of them.
 
     Args:
-        file: whose name is that of a file of the set.
-        head: by the pages.
+        file: path of the file; in a set, `places` has its name.
+        head: the header by the tags of the pages.
         text: the description of the first page.
-        places: those in a set of files, see `places_in_set`.
+        places: places of the pages in a set of files, see `places_in_set`.
 
     Raises:
         Refused: another type of pixels than it states, or more bits than they have.
@@ -254,14 +262,14 @@ def of_file(
             found = sorted({one[key] for _, one in elements(text, name) if key in one})
             for page in range(head.pages if found else 0):
                 _add(stated, f"{name} {key}", page, " or ".join(found), head.pages)
-    pages = [(sum(place[1:]), place) for place in _planes(text)]  # one of them runs
-    if places:
-        pages = [*enumerate(places[file.name])]
-    for page, plane in ((page, plane) for page, at in pages for plane in _planes(text).get(at, ())):
-        if "ExposureTime" in plane and page < head.pages:
-            unit = plane.get("ExposureTimeUnit", "s")
-            if (time := number_of(plane["ExposureTime"], f"{file}: ExposureTime")) is not None:
-                _add(stated, "ExposureTime", page, milliseconds(file, time, unit), head.pages)
+    planes = _planes(text)
+    pages = [(sum(place[1:]), place) for place in planes]  # one of C, Z and T runs
+    for page, place in enumerate(places[file.name]) if places else pages:
+        for plane in planes.get(place, ()):
+            if "ExposureTime" in plane and page < head.pages:
+                unit = plane.get("ExposureTimeUnit", "s")
+                if (time := number_of(plane["ExposureTime"], f"{file}: ExposureTime")) is not None:
+                    _add(stated, "ExposureTime", page, milliseconds(file, time, unit), head.pages)
     return head._replace(stated=stated)
 
 

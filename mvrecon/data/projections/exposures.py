@@ -94,10 +94,10 @@ def in_base_units(values: np.ndarray, name: str, unit: str, where: object) -> np
     """Times in s and currents in A; other attributes as they are.
 
     Args:
-        values: of an attribute.
-        name: of it.
-        unit: as the file states it; "" of none.
-        where: it is stated, for the message.
+        values: values of an attribute.
+        name: name of the attribute.
+        unit: unit that the file states; "" of none.
+        where: file and place of the values, for the message.
 
     Warns:
         UserWarning: an unknown unit; the values are NaN.
@@ -125,11 +125,11 @@ def unneeded(cure: str = "") -> Iterator[None]:
 
 
 def number_of(text: object, where: str) -> float | None:
-    """A number that the views do not need; None of what is none, with a warning.
+    """A finite number that the views do not need; None of other texts, with a warning.
 
     Args:
-        text: as a file states it.
-        where: it is stated: file and name, for the message.
+        text: text or number in a file.
+        where: file and name of the number, for the message.
     """
     with unneeded():
         try:
@@ -150,13 +150,13 @@ def named(exposure: str | Path) -> list[str]:
 
 
 def exposure_names(views: ProjectionStack, exposure: str | Path | None) -> list[str]:
-    """The attributes of `named`; empty if views do not all state them."""
+    """The attributes that an option `exposure` names; empty if views do not all state them."""
     names = [] if exposure is None else named(exposure)
     return names if names and views.exposure(*names) is not None else []
 
 
 def _values_of(texts: Iterable[str]) -> set[str]:
-    """All values of an attribute in texts of views; "" of none, several joined by " or "."""
+    """The values of an attribute in texts of views; "" of none, several joined by " or "."""
     return {word for text in texts for word in text.split(" or ")} - {""}
 
 
@@ -165,10 +165,10 @@ def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "")
     more than counts.
 
     Args:
-        path: of the views.
-        name: of the attribute.
-        texts: of each view; "" of none, several joined by " or ".
-        cure: what to do; by default, that of exposure and beam.
+        path: path of the views.
+        name: name of the attribute.
+        texts: text of each view; "" of none, several joined by " or ".
+        cure: advice that ends the warning; "": that for exposure and beam.
     """
     stated = _values_of(texts)
     own = "" if kind_of(name) == "beam" else f"{name} or "
@@ -191,8 +191,8 @@ def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "")
 
 
 def _numbers(words: Iterable[str]) -> dict[tuple[str, ...], np.ndarray]:
-    """What words state, in any case: by the units of one or several numbers, or by other texts, of
-    which the order does not count, a row of the numbers of each word.
+    """The numbers of words, a row for each word, by their units or other texts; order and case of
+    these do not count.
     """
     rows: dict[tuple[str, ...], list[list[float]]] = {}
     for word in words:
@@ -277,15 +277,15 @@ def _relative(
 
 
 def _of(field: ProjectionStack, name: str) -> Float[np.ndarray, " m"] | None:
-    """What a field states by a name, or in another unit; None if it does not."""
+    """An attribute of a field, also if it is stated in another unit; None if it is not stated."""
     found = _stated_as(field, name)
     values = None if found is None else field.exposure(found[0])
     return None if found is None or values is None else values * found[1]
 
 
 def _stated_as(field: ProjectionStack, name: str) -> tuple[str, float] | None:
-    """By what name a field states an attribute, in its own unit or another, and the factor to its
-    own; None if it does not.
+    """The name by which a field states an attribute, in its own unit or another, and the factor to
+    its own unit; None if it does not.
     """
     units = next((units for units in UNITS if name in units), {name: 1.0})
     names = (other for other in (name, *units) if field.exposure(other) is not None)

@@ -248,10 +248,8 @@ def filled(values: Float[Tensor, "m v u"], wrong: Bool[Tensor, "v u"]) -> Float[
         v, u = edge.nonzero(as_tuple=True)
         rows, columns = v[:, None] + BESIDE[0], u[:, None] + BESIDE[1]
         weights = (~wrong[rows, columns]).to(values)
-        rows, columns = (
-            (rows - 1).clamp(0, values.shape[1] - 1),
-            (columns - 1).clamp(0, values.shape[2] - 1),
-        )
+        rows = (rows - 1).clamp(0, values.shape[1] - 1)
+        columns = (columns - 1).clamp(0, values.shape[2] - 1)
         means = (values[:, rows, columns] * weights).sum(dim=-1) / weights.sum(dim=-1)
         values[:, v - 1, u - 1] = means
         wrong[v, u] = False

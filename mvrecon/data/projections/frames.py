@@ -133,11 +133,11 @@ class FrameViews(ProjectionStack):
     """Some frames of a data set.
 
     Args:
-        frames: all of them.
+        frames: all frames of the data set.
         numbers: numbers of the frames that are views.
         fields: flat and dark fields.
         rig: the rig that the file states.
-        scan: see `ProjectionStack`.
+        scan: HDF5 file of the scan, see `ProjectionStack`.
         stated: exposure and beam of all frames by name, a text for each, "" if none is stated.
         marked: mask of bad pixels.
         top: greatest grey value, if less than that of the type.

@@ -114,10 +114,10 @@ FIELDS = {
 
 
 class ImageFiles(ProjectionStack):
-    """Views as images, one in each file, or all in one file of several pages, or in those of a set.
+    """Views as images: one in each file, all in one file of several pages, or in an OME set.
 
     Args:
-        files: the views' files, in their order; those of a set have its own.
+        files: the views' files, in their order, which for a set is that of its description.
 
     Raises:
         Refused: images of several sizes or types, colours, a file that is damaged, or one with a
@@ -160,10 +160,8 @@ class ImageFiles(ProjectionStack):
             cure = "which the camera must have" if name in CAMERA_PLACES else ""
             exposures.warn_of_several(files[0].parent, name, texts, cure)
         self.files, self.excluded = list(files), headers[0].excluded
-        self.pixel_mm, self._tops = (
-            headers[0].pixel_mm,
-            frozenset().union(*(head.tops for head in headers)),
-        )
+        self.pixel_mm = headers[0].pixel_mm
+        self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,
             **dict(zip(ALIKE, headers[0].alike, strict=False)),
@@ -202,7 +200,7 @@ class ImageFiles(ProjectionStack):
 def _order_of(
     where: Path, places: Mapping[str, Sequence[PlaceInSet]], pages: Sequence[tuple[Path, int]]
 ) -> list[int]:
-    """The order of pages of files by their places in a set, if there is one, else as they are."""
+    """The numbers of pages in the order of their places in a set; without a set, as they are."""
     if not places:
         return [*range(len(pages))]
     own = [places[file.name][page] for file, page in pages]
@@ -336,12 +334,12 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
 
 
 def _of_set(files: Sequence[Path], gaps: bool, chosen: bool) -> list[Path]:
-    """TIFF files of one set by OME's description, which has their order; empty of others.
+    """TIFF files of one set by OME's description, which states their order; no files of others.
 
     Args:
-        files: in a folder.
-        gaps: others of the set may be missing anywhere.
-        chosen: they may be consecutive ones.
+        files: views in a folder.
+        gaps: allow a set with any files missing.
+        chosen: allow a set without its first or last files, as chosen by a pattern.
     """
     places = header(files[0]).places if _ending(files[0]) == "TIFF" else {}
     if not places:
@@ -419,7 +417,7 @@ def _dicom_header(file: Path) -> Header:
 
 
 def _texts(image: DicomImage, name: str) -> list[str]:
-    """What an image states by a name of each frame; "" of none."""
+    """An attribute of each frame of an image as text; "" where it is not stated."""
     single = image.groups and image.stated(name)
     found = (
         {str(value) for _, value in image.stated(name, k)}

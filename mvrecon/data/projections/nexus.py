@@ -11,13 +11,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from mvrecon.core.files.checks import (
-    Refused,
-    check_file,
-    file_errors,
-    millimetres,
-    shown,
-)
+from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import (
     VIEW_AXES,
@@ -202,7 +196,7 @@ def in_another(name: str | Path) -> Place | None:
 
 
 class _Layout(NamedTuple):
-    """Where a file has what."""
+    """The data sets of a scan in an HDF5 file."""
 
     frames: Place
     key: Place | None = None
@@ -224,7 +218,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def of(cls, path: Path, dataset: str | None, sinogram: bool) -> "_Layout":
-        """Find it in a file, by the name of the frames if given."""
+        """The layout of a file, by the name of the frames if given."""
         wanted = None if dataset is None else named(path, dataset)
         only = None if wanted is None else address(wanted)
         found, lost, names = {}, [], []
@@ -263,7 +257,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def _tomo(cls, path: Path, group: str, frames: Place) -> "_Layout":
-        """Of NXtomo, by the group with the frames and their keys."""
+        """The layout of NXtomo, by the group with the frames and their keys."""
 
         def first(*names: str) -> Place | None:
             parts = group.strip("/").split("/")
@@ -316,7 +310,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def _exchange(cls, path: Path, frames: Place, sinogram: bool) -> "_Layout":
-        """Of Data Exchange."""
+        """The layout of Data Exchange."""
         order = "y:theta:x" if sinogram else "theta:y:x"
         axes = texts_at([frames], "axes", EXPECTED).get(frames)
         if axes is not None and axes.replace(" ", "") != order:
@@ -345,21 +339,7 @@ class _Layout(NamedTuple):
         folder = scan.parent.resolve()
         frames = Frames(self.frames, folder)
         check_order(self.frames, self.axes, FRAMES)
-        keys = np.zeros(frames.shape[0], int)
-        if self.key is not None and self.sinogram:
-            raise Refused(f"{self.key}: expected no keys of sinograms, got some")
-        if self.key is not None:
-            keys = values_at(self.key, EXPECTED)
-            if keys.shape != (frames.shape[0],):
-                raise Refused(
-                    f"{self.key}: expected a key for each of {frames.shape[0]} frames, got "
-                    f"{keys.shape}"
-                )
-            if unknown := sorted({*keys.tolist()} - {VIEW, FLAT, DARK, INVALID, ALIGNMENT}):
-                raise Refused(
-                    f"{self.key}: expected keys 0 (views), 1 (flat), 2 (dark), 3 (invalid) or -1 "
-                    f"(alignment), got {shown(unknown)}"
-                )
+        keys = self._keys(frames.shape[0])
         lengths = [place for pair in self.pixel for place in pair]
         monitors = [place for _, place in (*self.exposures, *self.flats)]
         units = texts_at([*lengths, *monitors], "units", EXPECTED)
@@ -390,10 +370,36 @@ class _Layout(NamedTuple):
             rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW, EXPECTED)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
+        self._warn_of_moves(keys, pixel)
+        return FrameViews(
+            frames, views, fields, rig, scan, stated, *limits_of(self.detector, frames, keys)
+        )
+
+    def _keys(self, count: int) -> np.ndarray:
+        """The image_key of each of so many frames; all are views without one."""
+        if self.key is None:
+            return np.zeros(count, int)
+        if self.sinogram:
+            raise Refused(f"{self.key}: expected no keys of sinograms, got some")
+        keys = values_at(self.key, EXPECTED)
+        if keys.shape != (count,):
+            raise Refused(
+                f"{self.key}: expected a key for each of {count} frames, got {keys.shape}"
+            )
+        if unknown := sorted({*keys.tolist()} - {VIEW, FLAT, DARK, INVALID, ALIGNMENT}):
+            raise Refused(
+                f"{self.key}: expected keys 0 (views), 1 (flat), 2 (dark), 3 (invalid) or -1 "
+                f"(alignment), got {shown(unknown)}"
+            )
+        return keys
+
+    def _warn_of_moves(self, keys: np.ndarray, pixel: tuple[float, float] | None) -> None:
+        """Warn of translations of the sample between views, by more than a part of a pixel."""
         below = nexus_axes.translations_below(self.angles, EXPECTED) if self.angles else ()
         for place in dict.fromkeys((*self.moves, *below)):
             moved = values_at(place, EXPECTED, ("units", *nexus_axes.ATTRIBUTES)).ravel()
-            far = np.ptp(moved[views]) if len(moved) == len(keys) and len(views) else 0
+            views = moved[keys == VIEW] if len(moved) == len(keys) else moved[:0]
+            far = np.ptp(views) if len(views) else 0
             unit = texts_at([place], "units", EXPECTED).get(place)
             if far and not (
                 pixel and unit and far * millimetres(place, unit) < MAX_MOVE_PX * min(pixel)
@@ -401,14 +407,11 @@ class _Layout(NamedTuple):
                 warnings.warn(
                     f"{place}: the sample moved by {far:g}{f' {unit}' if unit else ''} between "
                     f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
-                    stacklevel=2,
+                    stacklevel=3,
                 )
-        return FrameViews(
-            frames, views, fields, rig, scan, stated, *limits_of(self.detector, frames, keys)
-        )
 
     def _pixel_mm(self, units: dict[Place, str]) -> tuple[float, float] | None:
-        """Rows' and columns' pitch; None if the file has none with units."""
+        """Pixel size (v, u) in mm; None if the file has none with units."""
         for pair in self.pixel:
             sizes = []
             for place in pair:
@@ -425,7 +428,7 @@ class _Layout(NamedTuple):
 
 
 def _members(path: Path, entry: str, name: str) -> list[str]:
-    """The names of what is in a group of an entry, behind that of the group."""
+    """The members of a group of an entry, as <group>/<member>; none if it is not there."""
     if (place := there(path, f"{entry}/{name}")) is None:
         return []
     with opened(place.path, EXPECTED) as file:

@@ -44,7 +44,7 @@ def degrees_of(angles: Place, kept: np.ndarray, expected: str) -> list[float]:
     Args:
         angles: place of the angles of all frames, or of the views.
         kept: whether a frame is a view.
-        expected: what should be there, for messages.
+        expected: description of a file with such angles, for messages.
 
     Warns:
         UserWarning: angles of a unit that look like another.

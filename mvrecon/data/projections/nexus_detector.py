@@ -47,7 +47,7 @@ KEYS = (
 
 
 def there(path: Path, name: str) -> Place | None:
-    """A data set that is not needed: None as well if it is in a file that is not there."""
+    """An optional data set; None also if it is in another file, which is missing."""
     try:
         return followed(path, name, EXPECTED)
     except MissingFile:
@@ -55,8 +55,8 @@ def there(path: Path, name: str) -> Place | None:
 
 
 def of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarray:
-    """What a file states of each frame by a name, as texts: an exposure in s or A, or a property of
-    the beam; of one value for all, one of each frame, or one of each view; "" of frames without.
+    """An attribute of each frame as text, an exposure in s or A or a property of the beam; "" where
+    it is not stated. The file has one value for all, one for each frame, or one for each view.
 
     Warns:
         UserWarning: no numbers of an exposure, another number of them, or a time or current of an
@@ -87,7 +87,7 @@ def of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarra
 
 
 def _texts_of(name: str, place: Place, unit: str) -> list[str]:
-    """What a data set states, as texts; "" of what is not finite, or of an unknown unit.
+    """The values of a data set as texts; "" of those that are not finite, or of an unknown unit.
 
     Raises:
         Refused: an exposure that is no number, or many texts.
@@ -115,9 +115,9 @@ def limits_of(
     it does not state. Compares the order of the frames.
 
     Args:
-        detector: the group; None: of a file that has none.
-        frames: all of the file.
-        keys: the image_key of each.
+        detector: group of the detector; None of a file without one.
+        frames: all frames of the file.
+        keys: image_key of each frame.
 
     Warns:
         UserWarning: a mask of another size, other values than one number, an underload.

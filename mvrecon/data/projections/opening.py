@@ -163,8 +163,8 @@ def exposures(
             ) from error
     if len(values) != stack.n_views or not (np.isfinite(values) & (values > 0)).all():
         raise Refused(
-            f"{path}: expected a positive exposure for each of {stack.n_views} views on "
-            f"disk, relative to the flat field's, got {len(values)} from {values.min():.4g} to "
+            f"{path}: expected a positive exposure for each of {stack.n_views} views on disk, "
+            f"relative to the flat field's, got {len(values)} from {values.min():.4g} to "
             f"{values.max():.4g}"
         )
     return torch.from_numpy(values).float()
@@ -260,7 +260,7 @@ def _field(
 def _field_at(
     views: ProjectionStack, name: str, value: str, layout: Layout | None
 ) -> ProjectionStack:
-    """A field's images by their name in the views' file, or by their own path."""
+    """A field's images by their name in the scan's HDF5 file, or by their own path."""
     if views.scan and (place := _place_in(views, value)):
         frames = Frames(place, views.scan.parent.resolve())
         stack: ProjectionStack = FrameViews(frames, np.arange(frames.shape[0]))
@@ -275,7 +275,7 @@ def _field_at(
 
 
 def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:
-    """The data set of a name in the scan's file, if any; None of a name that is a file."""
+    """The data set of a name in the scan's HDF5 file; None if there is none, or a file of it."""
     if views.scan is None or Path(name).expanduser().exists():
         return None
     if (place := followed(views.scan, str(name), EXPECTED)) is None:
@@ -285,7 +285,7 @@ def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:
 
 
 def _absent(views: ProjectionStack, name: str | Path) -> str:
-    """That the scan's file has no data set of a name, for messages; nothing of other views."""
+    """The end of a message: that the scan's HDF5 file has no data set of a name; else empty."""
     if views.scan is None:
         return ""
     contained = listing(views.scan, EXPECTED)

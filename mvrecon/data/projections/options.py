@@ -1,4 +1,4 @@
-"""What one may say about measured views on disk, and how they are corrected."""
+"""Options of measured views on disk and of their correction."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

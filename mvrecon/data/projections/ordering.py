@@ -48,16 +48,15 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     if len(paths) < 2:
         return list(paths)
     where, stems = paths[0].parent, [re.sub(SCIENTIFIC, "x", path.stem.lower()) for path in paths]
-    number = INTEGER if _counted(DECIMAL, stems) else f"{DECIMAL}|{INTEGER}"
-    mixed_up = any(re.search(SCIENTIFIC, path.stem.lower()) for path in paths)  # 1e-1 and 1e0
-    exponents = f"{SCIENTIFIC}|{f'{EXPONENT}|' if mixed_up else ''}"
-    number = f"{exponents}{number}"
+    signed = any(re.search(SCIENTIFIC, path.stem.lower()) for path in paths)
+    exponents = f"{SCIENTIFIC}|{EXPONENT}|" if signed else f"{SCIENTIFIC}|"  # 1e-1 and 1e0
+    number = exponents + (INTEGER if _counted(DECIMAL, stems) else f"{DECIMAL}|{INTEGER}")
     files, parts, keys = _sorted(paths, number)
     rows = [keys[path][1::2] for path in files]
     alike = len({tuple(part[::2]) for part in parts.values()}) == 1
-    two = alike and _counted(COMMA, stems) and not _missing(rows)  # 2,10 is no 2.1
+    pairs = alike and _counted(COMMA, stems) and not _missing(rows)  # 2,10 is no 2.1
     readings = [rows]
-    for other in (EXPONENT,) if two else (EXPONENT, COMMA):
+    for other in (EXPONENT,) if pairs else (EXPONENT, COMMA):
         found = filter(None, (re.search(other, path.stem.lower()) for path in files))
         if (such := next(found, None)) is None:
             continue
@@ -77,24 +76,8 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
             f"{files[0].name}, {files[1].name}, ...",
             stacklevel=2,
         )
-    words: dict[tuple[str, ...], list[Path]] = {}
-    for path in files:
-        words.setdefault(tuple(parts[path][::2]), []).append(path)
-    if len(words) > 1:
-        kinds = [f"{len(kind)} such as {kind[0].name}" for kind in words.values()]
-        got = " and ".join([*kinds[:4], *(["others"] if len(kinds) > 4 else [])])
-        if len(words) < len(files) and not mixed:
-            raise Refused(
-                f"{where}: expected views whose names differ in their numbers alone, got {got}; "
-                f"choose the views by pattern=... (views.pattern), such as scan_*.tif, or * for "
-                f"all, and give dark and flat fields by dark and flat (views.dark, views.flat)"
-            )
-        names = ", ".join(path.name for path in files[:4])
-        warnings.warn(
-            f"{where}: names of the views differ in more than their numbers; they are in the order "
-            f"of their text: {names}, ...; there are {got}",
-            stacklevel=2,
-        )
+    if not alike:
+        _check_kinds(where, files, [tuple(parts[path][::2]) for path in files], mixed)
         return files
     for first, second in zip(files, files[1:], strict=False):
         if keys[first] == keys[second]:
@@ -105,7 +88,7 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     if all(map(_missing, readings)):
         if not gaps:
             check_steps(where, rows)
-        if _sorted(paths, f"{exponents}{INTEGER}")[0] != files:  # which no steps contradict
+        if _sorted(paths, exponents + INTEGER)[0] != files:  # and no steps decide between them
             warnings.warn(
                 f"{where}: the numbers in the names of the views are taken for decimals: "
                 f"{', '.join(path.name for path in files[:4])}, ...",
@@ -114,13 +97,37 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
     return files
 
 
+def _check_kinds(
+    where: Path, files: Sequence[Path], words: Sequence[tuple[str, ...]], mixed: bool
+) -> None:
+    """Warn of files whose names differ in more than their numbers, by the words of each name; raise
+    if some of the names are numbered, unless these are mixed on purpose.
+    """
+    kinds: dict[tuple[str, ...], list[Path]] = {}
+    for path, own in zip(files, words, strict=True):
+        kinds.setdefault(own, []).append(path)
+    examples = [f"{len(kind)} such as {kind[0].name}" for kind in kinds.values()]
+    got = " and ".join([*examples[:4], *(["others"] if len(kinds) > 4 else [])])
+    if len(kinds) < len(files) and not mixed:
+        raise Refused(
+            f"{where}: expected views whose names differ in their numbers alone, got {got}; "
+            f"choose the views by pattern=... (views.pattern), such as scan_*.tif, or * for "
+            f"all, and give dark and flat fields by dark and flat (views.dark, views.flat)"
+        )
+    warnings.warn(
+        f"{where}: names of the views differ in more than their numbers; they are in the order of "
+        f"their text: {', '.join(path.name for path in files[:4])}, ...; there are {got}",
+        stacklevel=3,
+    )
+
+
 def _sorted(
     paths: Sequence[Path], number: str
 ) -> tuple[list[Path], dict[Path, list[str]], dict[Path, list[str | Decimal]]]:
     """Files by the numbers in their names, the words and numbers of each name, and as sorted.
 
     Args:
-        paths: of the files.
+        paths: paths of the files.
         number: pattern of numbers.
     """
     parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
@@ -150,8 +157,8 @@ def _move_signs(parts: Sequence[list[str]]) -> None:
 
 
 def _counted(pattern: str, stems: Sequence[str]) -> bool:
-    """Whether numbers of a pattern of decimals in names are pairs of integers: "1.9" is followed by
-    "1.10", a smaller decimal.
+    """Whether what matches a pattern of decimals in names are pairs of integers: after "1.9" comes
+    "1.10", which is the smaller decimal.
     """
     places = [re.split("[.,]", text)[1] for stem in stems for text in re.findall(pattern, stem)]
     ends = any(len(part) > 1 and part.endswith("0") for part in places)
@@ -172,7 +179,7 @@ def check_steps(where: Path, numbers: Sequence[Sequence[Any]]) -> None:
 
 
 def _missing(numbers: Sequence[Sequence[Any]]) -> str:
-    """What is missing in names of these decimals, for messages; nothing of a complete series."""
+    """What a complete series with the numbers of these names would have; empty if it is one."""
     if len({*map(len, numbers)}) > 1:
         return "equally many numbers in every name"
     columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]

@@ -30,21 +30,15 @@ PNG_KEYS = (
     Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
 )
 #: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
-PLAIN, INTERLACED = (
-    [(0, 0, 1, 1)],
-    [
-        (0, 0, 8, 8),
-        (4, 0, 8, 8),
-        (0, 4, 4, 8),
-        (2, 0, 4, 4),
-        (0, 2, 2, 4),
-        (1, 0, 2, 2),
-        (0, 1, 1, 2),
-    ],
-)
+PLAIN = [(0, 0, 1, 1)]
+INTERLACED = [
+    *((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2)),
+    (0, 1, 1, 2),
+]
 
 
 def png_header(file: Path) -> Header:
+    """Header of a PNG; raises Refused for colours and for `PNG_KEYS` to refuse."""
     with _png(file) as image:
         columns, rows = image.size
         with file.open("rb") as raw:
@@ -63,6 +57,7 @@ def png_header(file: Path) -> Header:
 
 
 def png_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
+    """The one image of a PNG; raises Refused if it is cut short."""
     _check_rows(file)
     with _png(file) as image:
         yield np.asarray(image).astype(MODES[image.mode], copy=False)

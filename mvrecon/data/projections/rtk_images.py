@@ -115,7 +115,7 @@ def rtk_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     reader = _reader(file)
     reader.Update()
     values = _itk(file).array_from_image(reader.GetOutput())[first:last]
-    if PIXELS[ENDINGS[file.suffix.lower()]][0] == "i4":  # of which RTK takes the sign for a bit
+    if PIXELS[ENDINGS[file.suffix.lower()]][0] == "i4":  # whose sign RTK takes for a bit
         values = np.where(values >= 2.0**31, values - np.float32(2.0**32), values)
     yield from values
 
@@ -137,7 +137,9 @@ def _itk(file: Path) -> Any:
 
 
 def _check_edf(file: Path) -> tuple[str, dict[str, list[str]]]:
-    """The type of the pixels, and what the header states of the exposure."""
+    """The type of the pixels, and the exposure by the names in the header; raises Refused for
+    `EDF_KEYS` to refuse.
+    """
     with file.open("rb") as raw:
         text = raw.read(EDF_HEADER)
     ends = [n for n in range(EDF_BLOCK, len(text) + 1, EDF_BLOCK) if text[n - 2 : n] == b"}\n"]

@@ -9,7 +9,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.machine import check_memory
 from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack
 
-#: What a stack states of all views together.
+#: Attributes of a stack that hold for all views together.
 OF_ALL = (
     *("kind", "unit", "dose", "own_unit", "duration_s", "total_s", "began", "window_kev"),
     *("attenuated", "detector", "rig", "mirrored", "scan"),

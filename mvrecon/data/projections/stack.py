@@ -33,19 +33,24 @@ MAX_PITCH_DIFFERENCE = 1e-3
 MU_FILE = "mu.nii.gz"
 #: Pixels per read when iterating over a whole stack, 64 MiB in float32.
 READ_PIXELS = 2**24
-
-
 #: A place in a set of files: the number of the image, and of the plane along C, Z and T.
 PlaceInSet = tuple[int, ...]
 
 
 class Header(NamedTuple):
-    """Properties of an image file: rows and columns, pixel type, pages, the largest grey values of
-    these, None of floats, the pixel size in mm (v, u), if stated, attributes that all views must
-    have in common, those on which grey values or places depend, by their names a text for each
-    page, whether values are stated to be in proportion to intensity, where negative values mark bad
-    pixels, how many of these the file states, and, of a set of files, the place of each page by the
-    file's name.
+    """Properties of an image file.
+
+    Args:
+        shape: rows and columns.
+        dtype: type of the pixels.
+        pages: number of images.
+        tops: largest grey values of the pages; None of floats.
+        pixel_mm: pixel size (v, u) in mm, if stated.
+        alike: attributes that all views must have in common.
+        stated: attributes on which grey values or places depend, by name a text for each page.
+        linear: whether values are stated to be in proportion to intensity.
+        excluded: where negative values mark bad pixels, the number of these that the file states.
+        places: for a set of files, the places of the pages of each, by the file's name.
     """
 
     shape: tuple[int, int]
@@ -85,7 +90,7 @@ class ProjectionStack(ABC):
     unit: str | None = None
     #: Expected counts per this unit, by which counts are divided; None: none is known.
     dose: float | None = None
-    #: Whether the unit is that of one count, which is another activity in another measurement.
+    #: Whether the unit is that of one count: another activity in each measurement.
     own_unit: bool = False
     #: Duration of the measurement in s, if stored.
     duration_s: float | None = None
@@ -147,8 +152,8 @@ class ProjectionStack(ABC):
 
     @property
     def marked(self) -> Bool[Tensor, "v u"] | None:
-        """Pixels that the files mark as bad in all views: those that are negative in the first;
-        None if they mark none.
+        """Pixels that the files mark as bad in all views, those that are negative in the first;
+        None of files without such marks.
 
         Warns:
             UserWarning: the files state more.
@@ -269,7 +274,7 @@ class NpyViews(ProjectionStack):
         super().__init__(path, names, self._array.shape[1:], self._array.dtype)
 
     def _block(self, first: int, last: int) -> np.ndarray:
-        if (got := self.path.stat().st_size) < self._bytes:  # reading it would end the process
+        if (got := self.path.stat().st_size) < self._bytes:  # else a bus error ends the process
             raise Refused(f"{self.path}: expected {self._bytes} bytes, as before, got {got}")
         return self._array[first:last]
 

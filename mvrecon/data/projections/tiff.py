@@ -17,7 +17,7 @@ from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
 #: Tags of EXIF on which grey values depend, but not in a proportion that all cameras share.
 EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureBiasValue")
-#: Those of them that are two whole numbers.
+#: Those of them that are stored as numerator and denominator.
 RATIOS = ("FNumber", "ExposureBiasValue")
 #: Tags of TIFF that change the pixels or their order.
 TIFF_KEYS = (
@@ -136,7 +136,7 @@ def tiff_header(file: Path) -> Header:
 
 
 def _description(file: Path, text: str) -> str:
-    """The description of a file, where OME states that it is in another one beside it: that."""
+    """The description of a file, or that of the file beside it to which OME's text refers."""
     for _, stated in descriptions.elements(text, "BinaryOnly"):
         other = file.with_name(Path(stated.get("MetadataFile", "")).name or file.name)
         if other != file and other.is_file():
@@ -197,7 +197,7 @@ def _check_order(
     places: Mapping[str, Sequence[PlaceInSet]],
 ) -> None:
     """Raise for pages that are not in the order of one axis, by the description of the first and
-    the PageNumbers of all; of a file of a set, for other pages than those with places in it.
+    the PageNumbers of all; for a file of a set, if its pages are not those with places in it.
     """
     known = [number[0] for number in numbers if number]
     if known != sorted(known):

@@ -130,6 +130,7 @@ class MeasuredViews:
             where = Path(options.path).expanduser()
             whole = exposures(options.exposure, stack, where, options.flat, options.layout)
             self.exposure = whole[:: options.every]
+        self.saturation = math.inf
         if self.kind == "intensities":
             self.saturation = options.saturation or stack.top or math.inf
             self.fields  # noqa: B018 - refuses before any view is read
@@ -245,8 +246,12 @@ class MeasuredViews:
         return Corrected(views, mask, odd)
 
     def _corrected(self, raw: Float[Tensor, "n v u"], first: int, kept: slice) -> Corrected:
-        """Those of stored views that are kept, from the view `first` on; the others tell zingers of
-        views with few rows.
+        """The views in `kept` of stored ones, corrected.
+
+        Args:
+            raw: stored values of consecutive views.
+            first: number of the first view that is kept.
+            kept: the views to correct; the others tell zingers of views with few rows.
         """
         bad = self.bad
         near = range(first - kept.start, first - kept.start + len(raw))
@@ -258,8 +263,8 @@ class MeasuredViews:
             few = self._few
             bright = (zingers(light.swapaxes(0, 1)).swapaxes(0, 1) if few else zingers(light))[kept]
         raw, values = raw[kept], values[kept]
-        marks = self.stack.excluded is not None
-        unread = (raw < 0) & ~bad if marks else torch.zeros_like(bright)
+        negative_marks = self.stack.excluded is not None
+        unread = (raw < 0) & ~bad if negative_marks else torch.zeros_like(bright)
         lost = bright | unread
         for k in lost.flatten(1).any(dim=1).nonzero().flatten().tolist():
             values[k] = filled(values[k : k + 1], bad | lost[k])[0]
@@ -316,11 +321,8 @@ class MeasuredViews:
         Raises:
             Refused: no such mask, or more than half of the pixels.
         """
-        where, (top, bottom), (left, right) = (
-            self.options.path,
-            self.region.rows,
-            self.region.columns,
-        )
+        where = self.options.path
+        (top, bottom), (left, right) = self.region.rows, self.region.columns
         bad = torch.zeros(bottom - top, right - left, dtype=torch.bool)
         if (marked := self.stack.marked) is not None:
             bad = self._kept(marked)
@@ -349,10 +351,9 @@ class MeasuredViews:
                 f"bad ones of {bad.numel()}"
             )
         if count := int(bad.sum()):
-            rows, columns = range(self.stack.shape[0]), range(self.stack.shape[1])
             rows, columns = (
-                way[::-1] if flip else way
-                for way, flip in zip((rows, columns), self.flips, strict=True)
+                range(size)[::-1] if flip else range(size)
+                for size, flip in zip(self.stack.shape, self.flips, strict=True)
             )
             places = in_words(bad, rows[top:bottom], columns[left:right])
             warnings.warn(
@@ -433,30 +434,19 @@ class MeasuredViews:
                 f"{NEGATIVE:g}; {cause}",
                 stacklevel=3,
             )
-        if bright := odd["zingers"]:
-            warnings.warn(
-                f"{self.options.path}: {bright} pixels of {self.n_views} views are brighter than "
-                f"all their neighbours in one view (zingers); they are filled from these and left "
-                f"out of the mask",
-                stacklevel=3,
-            )
-        if unread := odd["unread"]:
-            warnings.warn(
-                f"{self.options.path}: {unread} pixels of {self.n_views} views are negative, which "
-                f"marks bad ones; they are filled from their neighbours and left out of the mask",
-                stacklevel=3,
-            )
-        if saturated := odd["saturated"]:
-            warnings.warn(
-                f"{self.options.path}: {saturated} pixels of {self.n_views} views are "
-                f"saturated (grey value {self.saturation:g} or more); they are left out of the "
-                f"mask",
-                stacklevel=3,
-            )
-        if floored := odd["floored"]:
-            warnings.warn(
-                f"{self.options.path}: {floored} pixels of {self.n_views} views have a "
-                f"transmission of at most {self.options.floor:g}; they count as "
-                f"{-math.log(self.options.floor):.3g}",
-                stacklevel=3,
-            )
+        floor = self.options.floor
+        for name, words in {
+            "zingers": "are brighter than all their neighbours in one view (zingers); they are "
+            "filled from these and left out of the mask",
+            "unread": "are negative, which marks bad ones; they are filled from their neighbours "
+            "and left out of the mask",
+            "saturated": f"are saturated (grey value {self.saturation:g} or more); they are left "
+            f"out of the mask",
+            "floored": f"have a transmission of at most {floor:g}; they count as "
+            f"{-math.log(floor):.3g}",
+        }.items():
+            if count := odd[name]:
+                warnings.warn(
+                    f"{self.options.path}: {count} pixels of {self.n_views} views {words}",
+                    stacklevel=3,
+                )

@@ -83,7 +83,7 @@ def write_projections(
     `Measured(path=folder)` reads it.
 
     Args:
-        folder: new, or empty.
+        folder: folder of the images, new or empty.
         integrals: line integrals of the views; an iterable is consumed one view at a time.
         exposure: photons and grey values; None: 1e4 photons.
 
@@ -122,6 +122,7 @@ def write_projections(
 
 
 def _write(path: Path, grey: Float[Tensor, "v u"]) -> None:
+    """Write grey values as a 16-bit TIFF."""
     from PIL import Image as Pillow
 
     Pillow.fromarray(grey.numpy().astype(np.uint16)).save(path, format="TIFF")

@@ -150,6 +150,25 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
     return Grid.centred(size=counts, spacing=step, centre=centre.tolist())
 
 
+def extended_to_field(cameras: Cameras, grid: Grid) -> Grid:
+    """A grid with more voxels on each side where it ends inside the field of half of the views, by
+    more than half of a pixel's image; the grid itself for a rig without such a field.
+    """
+    try:
+        field = auto_grid(cameras, seen_by=0.5)
+    except ValueError:  # of a rig without a common field
+        return grid
+    low, high = grid.to_index(field.corners()).aminmax(dim=0)
+    slack = max(field.spacing) / 2 / low.new_tensor(grid.spacing)
+    before = (-0.5 - slack - low).ceil().clamp_min(0)
+    after = (high - low.new_tensor(grid.size) + 0.5 - slack).ceil().clamp_min(0)
+    affine = grid.affine.clone()
+    affine[:3, 3] = grid.to_world(-before)
+    more = (before + after).long().tolist()
+    x, y, z = (n + k for n, k in zip(grid.size, more, strict=True))
+    return Grid((z, y, x), affine)
+
+
 def half_fan(cameras: Cameras) -> bool:
     """Whether a rig is a half fan: views all around the isocentre, with detectors that reach
     farther on the same side of it, so that half of the views see the outer field.

@@ -117,7 +117,7 @@ class Detector:
             source: sources or pinholes in mm; for parallel beams, the start of the beam's axis.
             centre: position of the detector's centre in mm, before `offset_mm`.
             R: rows right, down and forward as seen from the source towards the object (`look_at`).
-            parallel, extent: as in `Cameras`.
+            parallel, extent: see `Cameras`.
         """
         (down, right), (rows, columns) = self.pixel_mm, self.pixels
         u, v = R[:, 0] * right, R[:, 1] * down

@@ -179,8 +179,8 @@ def alignment(
     alone: an expected view made from the measured ones shares their errors.
 
     Args:
-        views: measured.
-        expected: A x, in the same unit.
+        views: measured views.
+        expected: expected views A x, in the same unit.
         weight: weight of each pixel, at least 0; by default 1.
         start: initial alignment; by default of error-free cameras.
         steps: Gauss-Newton steps.
@@ -211,7 +211,7 @@ def alignment(
 
 
 class _ViewFit(NamedTuple):
-    """Least squares of every view in its own three parameters.
+    """The least-squares fit of each view's own three parameters.
 
     Args:
         columns: derivatives by either shift, per pixel, and by the gain.
@@ -286,8 +286,8 @@ def least_deviations(
 
     Args:
         values: values of each camera.
-        modes: common to all cameras.
-        floor: lengths below count as zero.
+        modes: modes common to all cameras.
+        floor: length below which values count as zero.
     """
     dtype, values, modes = values.dtype, values.double(), modes.double()
     rest, flat = values, modes.flatten(0, 1)

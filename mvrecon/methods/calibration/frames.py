@@ -72,7 +72,7 @@ def frame_shifts(
         grid: grid of the volume.
         counts: counts of all frames, one after the other.
         views: number of the views of each frame.
-        background: expected counts of other origin.
+        background: expected counts of other origin, such as scatter.
         iterations, subsets: number of OSEM's iterations in each round, and of its subsets.
         rounds: maximum number of rounds.
 
@@ -127,7 +127,7 @@ def _frames(
     slopes: Float[Tensor, "k m v u"],
     views: Sequence[int],
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """The same for each frame."""
+    """Counts, expected counts and slopes of each frame."""
     return zip(*(part.split(list(views), 1) for part in (counts, expected, slopes)), strict=True)
 
 

@@ -77,6 +77,7 @@ def centroids(
 def _centroid(
     view: Float[Tensor, "v u"], pixels: Float[Tensor, "v u 2"], place: Tensor, radius: float
 ) -> Float[Tensor, "2"]:
+    """The centroid of a marker near a place, in pixels; NaN where there is none."""
     last = place.new_tensor(view.shape[::-1]) - 1
     for _ in range(CENTRINGS):
         if not ((place - radius >= 0) & (place + radius <= last)).all():
@@ -99,7 +100,7 @@ def _centroid(
     return place
 
 
-#: Fewest visible markers of a view: 11 unknowns, two numbers a marker.
+#: Fewest visible markers of a view: 11 unknowns, two numbers per marker.
 MIN_MARKERS = 6
 #: Least spread of the markers' depths relative to their mean; below, the beams are nearly parallel.
 MIN_DEPTH_SPREAD = 2e-3
@@ -146,18 +147,16 @@ def dlt(points: Float[Tensor, "n 3"], uv: Float[Tensor, "m n 2"]) -> Float[Tenso
 
 
 def _dlt(points: Tensor, uv: Tensor, m: int) -> Float[Tensor, "3 4"]:
+    """The projection matrix of the view m."""
     visible = uv.isfinite().all(dim=-1)
     if (count := int(visible.sum())) < MIN_MARKERS:
         raise ValueError(f"expected at least {MIN_MARKERS} markers in view {m}, got {count}")
     X, space = _normalised(points[visible])
     x, plane = _normalised(uv[visible])
     zero = torch.zeros_like(X)
-    rows = torch.cat(
-        [
-            torch.cat([X, zero, -x[:, :1] * X], dim=1),
-            torch.cat([zero, X, -x[:, 1:2] * X], dim=1),
-        ]
-    )
+    u_rows = torch.cat([X, zero, -x[:, :1] * X], dim=1)
+    v_rows = torch.cat([zero, X, -x[:, 1:2] * X], dim=1)
+    rows = torch.cat([u_rows, v_rows])
     _, singular, V = torch.linalg.svd(rows)
     if not singular[10] > 1e-8 * singular[0]:
         raise ValueError(f"expected markers of view {m} that are not coplanar, got coplanar ones")
@@ -194,7 +193,7 @@ def from_markers(
     """Fit a rig in mm, sources and rectangular detectors with known pixels, to images of known
     markers.
 
-    The matrices of `dlt` initialise a least-squares fit of nine unknowns a view (source, detector
+    The matrices of `dlt` initialise a least-squares fit of nine unknowns per view (source, detector
     position and rotation), by Levenberg-Marquardt steps through `Cameras.project`.
 
     Args:
@@ -226,10 +225,8 @@ def from_markers(
     pitch = from_matrix(P, shape, 1.0).u.norm(dim=-1)
     start = _rectangular(from_matrix(P, shape, pixel_mm[1] / pitch), pixel_mm)
     target = uv.double()
-    values, damping = (
-        torch.zeros(len(P), 9, dtype=torch.float64),
-        torch.full((len(P),), INITIAL_DAMPING),
-    )
+    values = torch.zeros(len(P), 9, dtype=torch.float64)
+    damping = torch.full((len(P),), INITIAL_DAMPING)
     cost = _residual(start, points, target, values).square().sum(dim=1)
     for _ in range(MAX_ROUNDS):
         r, J = _linearised(start, points, target, values)
@@ -239,10 +236,8 @@ def from_markers(
         trial = values + change[..., 0]
         new_cost = _residual(start, points, target, trial).square().sum(dim=1)
         better = new_cost < cost
-        values, cost = (
-            torch.where(better[:, None], trial, values),
-            torch.where(better, new_cost, cost),
-        )
+        values = torch.where(better[:, None], trial, values)
+        cost = torch.where(better, new_cost, cost)
         damping = torch.where(better, damping / 10, damping * 10).clamp(1e-12, 1e12)
         if change.abs().max() < MIN_CHANGE:
             break
@@ -263,6 +258,7 @@ def _rectangular(cameras: Cameras, pixel_mm: tuple[float, float]) -> Cameras:
 
 
 def _rig(start: Cameras, values: Float[Tensor, "m 9"]) -> Cameras:
+    """The rig with the nine unknowns of each view."""
     return misaligned(start, Misalignment(*values.split(FIELD_WIDTHS, dim=-1)))
 
 

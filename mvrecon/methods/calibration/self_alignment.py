@@ -229,7 +229,7 @@ def agreement(
 
     Args:
         A: the operator of the nominal cameras.
-        views: measured.
+        views: measured views.
         weights: weights as `sirt_weights` returns them.
     """
     blank = ~views.flatten(3).any(dim=3)[:, 0]
@@ -259,11 +259,29 @@ def agreement(
         ):
             break  # the next round would be as this one
     level = _relative(gain, ~unlike & ~blank).log()
-    gain = torch.where(
-        level.abs().amax(dim=1, keepdim=True) > MIN_OUTLYING_LOG_GAIN, level, 0.0
-    ).exp()
-    gain = torch.where(unlike | blank, 1.0, gain)
-    kept = (~unlike & ~blank)[:, None, :, None, None].to(views)
+    outlying = level.abs().amax(dim=1, keepdim=True) > MIN_OUTLYING_LOG_GAIN
+    gain = torch.where(outlying & ~(unlike | blank), level, 0.0).exp()
+    gain, fit = _consistent(A, views, gain, ~unlike & ~blank, weights)
+    if not views.is_cuda and not blank.any():
+        return Agreement(unlike, gain)
+    y = views / gain[:, None, :, None, None]
+    norms, expected = (torch.linalg.vector_norm(z, dim=(1, 3, 4)) for z in (y, fit))
+    usual = norms.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
+    missed = blank & (expected > MAX_EMPTY_NORM * usual)
+    return Agreement(unlike | missed, gain)
+
+
+def _consistent(
+    A: Projector,
+    views: Float[Tensor, "b 1 m v u"],
+    gain: Float[Tensor, "b m"],
+    keep: Bool[Tensor, "b m"],
+    weights: SirtWeights,
+) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 1 m v u"]]:
+    """The gains of samples whose views they make much more consistent, else 1; and the projection
+    of the volume of the kept views, divided by these gains.
+    """
+    kept = keep[:, None, :, None, None].to(views)
     part = _among(A, kept.expand_as(views), weights)
     tried, rests, fits = kept * (gain != 1)[:, None, :, None, None], [], []
     for y in (views / gain[:, None, :, None, None], views):
@@ -271,21 +289,14 @@ def agreement(
         rest = fits[-1] - y
         sums = [(some * y).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
         left = [(some * rest).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
-        rests.append([divided(part, whole) for part, whole in zip(left, sums, strict=True)])
+        rests.append([divided(a, b) for a, b in zip(left, sums, strict=True)])
     (of_tried, of_all), (of_tried_before, of_all_before) = rests
     much = (of_tried < MAX_RESIDUAL_RATIO**2 * of_tried_before) | (
         of_all < MAX_RESIDUAL_RATIO**2 * of_all_before
     )
     better = much & (of_all < of_all_before)
-    gain = torch.where(better[:, None], gain, 1.0)
-    if not views.is_cuda and not blank.any():
-        return Agreement(unlike, gain)
-    y = views / gain[:, None, :, None, None]
-    fit = torch.where(better[:, None, None, None, None], *fits)
-    norms, expected = (torch.linalg.vector_norm(z, dim=(1, 3, 4)) for z in (y, fit))
-    usual = norms.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
-    missed = blank & (expected > MAX_EMPTY_NORM * usual)
-    return Agreement(unlike | missed, gain)
+    fit = torch.where(better[:, None, None, None, None], fits[0], fits[1])
+    return torch.where(better[:, None], gain, 1.0), fit
 
 
 def _relative(gain: Float[Tensor, "b m"], among: Bool[Tensor, "b m"]) -> Float[Tensor, "b m"]:
@@ -366,7 +377,7 @@ class Aligned(nn.Module):
 
     Args:
         method: name and options of the method.
-        alternations, iterations: as in `self_aligned`.
+        alternations, iterations: see `self_aligned`.
 
     Raises:
         LookupError: an unknown name.

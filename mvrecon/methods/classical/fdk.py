@@ -368,7 +368,7 @@ def fdk_streamed(
         read: read(first, last) returns the views first to last - 1 as an array [m v u].
         cameras: all cameras.
         grid: the voxels.
-        filter, cutoff, max_missing, weights_from, extrapolate: as in `fdk`.
+        filter, cutoff, max_missing, weights_from, extrapolate: see `fdk`.
 
     Returns:
         The volume on the grid, as `fdk` of all views at once.
@@ -463,7 +463,7 @@ def fbp(
     Args:
         A: the operator, whose grid and cameras are used.
         views: line integrals.
-        filter, cutoff, max_missing, extrapolate: as in `fdk`.
+        filter, cutoff, max_missing, extrapolate: see `fdk`.
 
     Returns:
         The volume on the operator's grid.

@@ -49,7 +49,7 @@ def mlem(
 
     Args:
         A: the operator, in counts per unit of the volume.
-        counts: measured.
+        counts: measured counts.
         iterations: number of iterations, each over all counts.
         background: expected counts of other origin, one number or views that broadcast to the
             counts.
@@ -133,7 +133,7 @@ def osem(
     Not differentiable, as `mlem`.
 
     Args:
-        A, counts, iterations, background, skip_zero_bins, common: as in `mlem`.
+        A, counts, iterations, background, skip_zero_bins, common: see `mlem`.
         subsets: number of subsets of the cameras; None: the square root of the number of cameras.
 
     Returns:

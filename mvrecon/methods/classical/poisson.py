@@ -32,7 +32,7 @@ class PoissonLikelihood:
 
     Args:
         A: the operator, in counts per unit of the volume.
-        counts: measured, [b c m v u]; rays without counts in the whole batch are skipped.
+        counts: measured counts [b c m v u]; rays without counts in the whole batch are skipped.
         background: expected counts r of other origin, one number or views that broadcast to the
             counts.
         views: indices of the views to use; all by default.

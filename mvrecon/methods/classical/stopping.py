@@ -122,7 +122,7 @@ def left_out_residual(
     Args:
         method: maps an operator and its views to a volume, such as `partial(sirt, iterations=20)`.
         A: the operator.
-        views: measured.
+        views: measured views.
 
     Raises:
         ValueError: fewer than two views, or values that are not finite.
@@ -204,7 +204,7 @@ def held_out(
     Args:
         method: an iterative reconstructor, such as `cgls`.
         A: the operator.
-        views: measured.
+        views: measured views.
         weights: values of the method's option `weight` to compare; None: its default.
         every: one view in so many is held out.
         patience: stop a trial after so many iterations without improvement in any sample.

@@ -289,7 +289,7 @@ class PerViewEstimates(nn.Module):
     Without widths there is no depth network, thus no confidence and no features.
 
     Args:
-        widths, features, scale, depths, binning, head, depth, precision: as in `CrossView`.
+        widths, features, scale, depths, binning, head, depth, precision: see `CrossView`.
         n_cameras: one network for each of so many cameras; None: one for all.
 
     Raises:

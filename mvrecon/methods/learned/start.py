@@ -57,7 +57,7 @@ class CaseCache:
             make: computes results [n ...] of n samples from their indices.
             A: the operator.
             options: options of the computation.
-            views: measured.
+            views: measured views.
             support: support of each sample; None: all voxels.
         """
         parts: Sequence[Tensor | None] = [None] * len(views) if support is None else list(support)

@@ -79,7 +79,7 @@ def support_from_views(
             `noise_threshold`. Both also support `witnesses`, the number of views that must agree:
             by default `thin_witnesses`, with photons at least 3.
         brick: edge in voxels; by default `brick_edge`.
-        keep_unseen: as in `visual_hull`; False gives the support of the visible part only.
+        keep_unseen: see `visual_hull`; False gives the support of the visible part only.
 
     Warns:
         UserWarning: voxels are smaller than the gap of rays, so bodies of that size can be lost.
@@ -108,7 +108,7 @@ def hull_mask(
     with a GPU.
 
     Args:
-        views, cameras, grid, noise: as in `support_from_views`, which also returns the box.
+        views, cameras, grid, noise: see `support_from_views`, which also returns the box.
 
     Raises:
         ValueError: as `support_from_views`.
@@ -129,7 +129,7 @@ def support_masks(
     by "auto" the hull if its box is small, else the whole grid.
 
     Args:
-        views, cameras, grid, noise: as in `support_from_views`.
+        views, cameras, grid, noise: see `support_from_views`.
         kind: "hull", "box" or "auto".
     """
     hull = hull_mask(views, cameras, grid, noise)

@@ -314,7 +314,7 @@ def planes(
     Values from 0 to the case's range; errors, volume - truth, to a fourth of it.
 
     Args:
-        case: its grid and range.
+        case: grid and range of the case.
         truth: the true values.
         volumes: volumes by name; further lines of a name, such as figures, are printed below it.
         marked: the truth with a support's outline, drawn instead.
@@ -560,7 +560,7 @@ def alignments(
     green ring, under a legend.
 
     A tile's centre is an error-free camera, its circle a pixel; larger shifts are clamped to its
-    edge. At most four tiles a row.
+    edge. At most four tiles per row.
 
     Args:
         shift_px: estimated shifts, along columns (to the right) and rows (downwards).

@@ -50,7 +50,7 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
 
     Args:
         cameras: the rig.
-        grid: its box is drawn; none by default.
+        grid: grid whose box is drawn; none by default.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -181,7 +181,7 @@ def segments(cameras: Cameras, grid: Grid | None = None) -> dict[str, Segments]:
 
     Args:
         cameras: the rig, about `DRAWN_LINES` of whose cameras are drawn.
-        grid: its box is drawn; none by default.
+        grid: grid whose box is drawn; none by default.
     """
     rig = cameras.to("cpu")
     chosen = sorted({0, *range(0, len(rig), max(1, len(rig) // DRAWN_LINES))})

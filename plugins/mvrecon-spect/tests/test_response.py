@@ -175,8 +175,8 @@ def test_a_grid_far_beyond_the_depths_of_a_table_is_told(tmp_path, recwarn):
     path = table(tmp_path / "psf.csv", (140, 0, 3, 3), (180, 0, 2.8, 2.8))
     for depth, told in ((130, False), (150, False), (200, False), (90, True), (260, True)):
         recwarn.clear()
-        Spect(Grid.centred(2, spacing=1.0, centre=(0, 0, depth)), pinhole(9), 2.3, None, True,
-              response=path)  # fmt: skip
+        grid = Grid.centred(2, spacing=1.0, centre=(0, 0, depth))
+        Spect(grid, pinhole(9), 2.3, blur=True, response=path)
         assert any("are extrapolated" in str(w.message) for w in recwarn) is told
 
 

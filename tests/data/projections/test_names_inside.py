@@ -2,7 +2,7 @@
 slash, as typed in any folder: on a command line, in a scan.yaml and in Python.
 """
 
-import os
+from contextlib import chdir
 
 import h5py
 import numpy as np
@@ -37,26 +37,25 @@ def scan(tmp_path):
 
 
 def typed(folder, views):
-    """The views of options as typed on a command line in a folder."""
-    here = os.getcwd()
-    os.chdir(folder)
-    try:
+    """The views of options as typed on a command line in a folder; its task may run elsewhere."""
+    with chdir(folder):
         settings = absolute_paths({"views": views}, ReconstructSettings)
-    finally:
-        os.chdir(here)  # the task may run elsewhere
     return MeasuredViews(Measured(**settings["views"]))
 
 
 def told(folder, views):
     """The views of options in a scan.yaml, of which a copy is written elsewhere."""
+    copy = folder / "copy"
+    copy.mkdir(exist_ok=True)
     (folder / NAME).write_text(yaml.safe_dump({"views": views}))
+    save(copy / NAME, {"views": options_in(folder)})
+    return typed(copy, options_in(copy))
+
+
+def options_in(folder):
+    """The options of views that the scan.yaml of a folder stands for."""
     words = dict(word.split("=", 1) for word in expanded([f"scan={folder}"]))
-    settings = {key.removeprefix("views."): text for key, text in words.items()}
-    (folder / "copy").mkdir(exist_ok=True)
-    save(folder / "copy" / NAME, {"views": settings})
-    words = dict(word.split("=", 1) for word in expanded([f"scan={folder / 'copy'}"]))
-    again = {key.removeprefix("views."): text for key, text in words.items()}
-    return typed(folder / "copy", again)
+    return {key.removeprefix("views."): text for key, text in words.items()}
 
 
 @pytest.mark.parametrize("way", [typed, told])

@@ -2,7 +2,7 @@
 names all files, and says which page of which is which image.
 """
 
-import re
+from html import escape
 
 import numpy as np
 import pytest
@@ -23,19 +23,19 @@ def described(pages, axis="T", binary=None, sizes=None):
     """OME's description of a set.
 
     Args:
-        pages: of each image, the file and the page there.
-        axis: along which images run; I: each is an image of its own.
+        pages: file and page of each image.
+        axis: axis along which images run; I: each is an image of its own.
         binary: name of the file that holds the description instead.
-        sizes: of the other axes: images run along these first.
+        sizes: sizes of the other axes, along which images run first.
     """
     if binary:
         return f'<OME xmlns="x"><BinaryOnly MetadataFile="{binary}" UUID="urn:uuid:1"/></OME>'
     sizes = {"Z": 1, "C": 1, "T": 1, **(sizes or {})}
+    inner = int(np.prod([*sizes.values()]))
     if axis != "I":
-        sizes[axis] = len(pages) // int(np.prod([*sizes.values()]))
-    images, rest = [""], ""
+        sizes[axis] = len(pages) // inner
+    images = [""]
     for k, (name, page) in enumerate(pages):
-        inner = int(np.prod([n for other, n in sizes.items() if other != axis]))
         place = {"Z": 0, "C": 0, "T": 0}
         if axis != "I":
             place |= {other: k % inner for other, n in sizes.items() if other != axis and n > 1}
@@ -44,14 +44,15 @@ def described(pages, axis="T", binary=None, sizes=None):
         the = " ".join(f'The{key}="{value}"' for key, value in place.items())
         images[-1] += (
             f'<TiffData IFD="{page}" {first} PlaneCount="1">'
-            f'<UUID FileName="{name}">urn:uuid:{k}</UUID></TiffData>'
+            f'<UUID FileName="{escape(name)}">urn:uuid:{k}</UUID></TiffData>'
             f'<Plane {the} ExposureTime="{TIMES[k]}" ExposureTimeUnit="ms"/>'
         )
         images += [""] * (axis == "I" and k + 1 < len(pages))
     head = " ".join(f'Size{key}="{n}"' for key, n in sizes.items())
-    for image in images:
-        rest += f'<Image ID="a"><Pixels Type="uint16" {head}>{image}</Pixels></Image>'
-    return f'<OME xmlns="x" UUID="urn:uuid:7">{rest}</OME>'
+    whole = "".join(
+        f'<Image ID="a"><Pixels Type="uint16" {head}>{image}</Pixels></Image>' for image in images
+    )
+    return f'<OME xmlns="x" UUID="urn:uuid:7">{whole}</OME>'
 
 
 def stored(folder, names, axis="T", binary=None, sizes=None):
@@ -74,7 +75,7 @@ SETS = {
     "images of their own": (ONE_EACH, {"axis": "I"}),
     "names without numbers": ([f"{'qwertyuiopas'[k]}.tif" for k in range(VIEWS)], {}),
     "names of several kinds": (["a.tif", *[f"a_{k}.tif" for k in range(1, VIEWS)]], {}),
-    "escaped names": ([f"a &amp; b{k}.tif" for k in SHUFFLED], {}),
+    "escaped names": ([f"a & b{k}.tif" for k in SHUFFLED], {}),
     "described in one": (ONE_EACH, {"binary": ONE_EACH[4]}),
     "split": (["a.ome.tif"] * 7 + ["a_1.ome.tif"] * 5, {}),
     "split and alternating": (["a.ome.tif", "b.ome.tif"] * 6, {}),
@@ -85,19 +86,11 @@ SETS = {
 def test_a_set_is_read_in_the_order_that_ome_states(case, tmp_path):
     """Whatever the names are, in which no view has its number; exposures go with their views."""
     names, options = SETS[case]
-    folder = stored(tmp_path / "scan", [name.replace("&amp;", "&") for name in names], **options)
-    if case == "escaped names":
-        for file in list(folder.iterdir()):
-            file.unlink()
-        pages = [(name, 0) for name in names]
-        for k, name in enumerate(names):
-            text = described(pages).encode()
-            written(folder / name.replace("&amp;", "&"), grey()[k], description=text)
-    stack = open_projections(folder)
+    stack = open_projections(stored(tmp_path / "scan", names, **options))
     assert np.array_equal(stack.read(0, VIEWS).numpy(), grey())
     assert np.array_equal(stack.read(5, 9).numpy(), grey()[5:9])
     assert [float(text) for text in stack.stated["ExposureTime"]] == TIMES
-    assert stack.names[0].startswith(names[0].split(".")[0].replace("&amp;", "&"))
+    assert stack.names[0].startswith(names[0].split(".")[0])
 
 
 #: Attributes of the elements of files of 7 and 5 pages.
@@ -241,4 +234,4 @@ def test_one_file_of_a_set_is_read_alone(tmp_path):
     written(tmp_path / "c.tif", grey(), description=text.encode())
     stack = open_projections(tmp_path / "c.tif")
     assert np.array_equal(stack.read(0, VIEWS).numpy(), grey())
-    assert re.fullmatch("c 0", stack.names[0])
+    assert stack.names[0] == "c 0"

@@ -196,7 +196,7 @@ def test_rigs_from_files_take_a_fitted_detector_where_it_does_not_move_them(tmp_
         fitted({**camera, "detector": {"pixels": 48, "pixel_mm": "fit"}}, PATIENT)
 
 
-def at(angles, make=circular, *lengths):
+def half_fans(angles, make, *lengths):
     """Half fans, or half acquisitions of parallel beams, at these angles."""
     return make(len(angles), *lengths, detector=HALF, angles=angles)
 
@@ -227,7 +227,7 @@ def test_a_half_fan_covers_all_directions_however_uneven(name, beam):
     """The complete field is that of an even turn. Also tried: 8 to 24 directions, one measured
     each time once to five times.
     """
-    rig, whole = at({**AROUND, **ARCS}[name], *beam), at(TURN, *beam)
+    rig, whole = half_fans({**AROUND, **ARCS}[name], *beam), half_fans(TURN, *beam)
     assert half_fan(rig) == (name in AROUND)
     if name in AROUND:
         grid, expected = (auto_grid(full_fan(each)) for each in (rig, whole))

@@ -10,8 +10,8 @@ Points = Sequence[tuple[float, float]]
 #: Part -> (ms, error) for increasing volumes, and voxels along an edge -> error floor.
 Pareto = tuple[Mapping[str, Points], Mapping[int, float]]
 MARKERS = "osD^v<>PX*hd8p"
-#: Words of labels of parts as a reader knows them.
-WORDS = {
+#: Names of parts and options as legends show them.
+LEGEND = {
     "drr": "mvrecon",
     "rtk": "RTK",
     "astra": "ASTRA",
@@ -28,7 +28,7 @@ def pareto(panels: Mapping[str, Pareto], path: Path) -> None:
     def draw(ax: Any, title: str, panel: Pareto) -> None:
         curves, floors = panel
         for marker, (label, points) in zip(cycle(MARKERS), sorted(curves.items()), strict=False):
-            style = {"marker": marker, "label": _told(label)}
+            style = {"marker": marker, "label": _legend(label)}
             (line,) = ax.plot(*zip(*points, strict=True), marker=marker, ms=4, lw=0.6, alpha=0.7)
             ax.plot(*points[-1], ms=9, linestyle="", color=line.get_color(), **style)
         for n, floor in floors.items():
@@ -40,17 +40,17 @@ def pareto(panels: Mapping[str, Pareto], path: Path) -> None:
     _figure(panels, path, draw)
 
 
-def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path, above: str) -> None:
+def scaling(panels: Mapping[str, Mapping[str, Points]], path: Path, title: str) -> None:
     """Time against the amount of work by label, one panel per kind of work; both axes are
-    logarithmic. The line above states the work that they start from.
+    logarithmic. The title states the work that all start from.
     """
 
     def draw(ax: Any, axis: str, curves: Mapping[str, Points]) -> None:
         for marker, (label, points) in zip(cycle(MARKERS), sorted(curves.items()), strict=False):
-            ax.plot(*zip(*points, strict=True), marker=marker, ms=4, lw=0.8, label=_told(label))
+            ax.plot(*zip(*points, strict=True), marker=marker, ms=4, lw=0.8, label=_legend(label))
         ax.set(xlabel=axis, ylabel="time, ms")
 
-    _figure(panels, path, draw, above)
+    _figure(panels, path, draw, title)
 
 
 def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], path: Path) -> None:
@@ -73,13 +73,13 @@ def speedups(panels: Mapping[str, Mapping[str, Sequence[tuple[str, float]]]], pa
     _figure(panels, path, draw)
 
 
-def _told(label: str) -> str:
-    """A label in the words of a reader."""
-    return " ".join(WORDS.get(word, word) for word in label.split())
+def _legend(label: str) -> str:
+    """A label of a part and its options as legends show it."""
+    return " ".join(LEGEND.get(word, word) for word in label.split())
 
 
 def _figure(
-    panels: Mapping[str, Any], path: Path, draw: Callable[[Any, str, Any], None], above: str = ""
+    panels: Mapping[str, Any], path: Path, draw: Callable[[Any, str, Any], None], title: str = ""
 ) -> None:
     if not panels or find_spec("matplotlib") is None:
         return
@@ -99,8 +99,8 @@ def _figure(
                 _label(axis)
     for spare in axes[len(panels) :]:
         spare.remove()
-    if above:
-        figure.suptitle(above)
+    if title:
+        figure.suptitle(title)
     handles, labels = axes[0].get_legend_handles_labels()
     if handles:
         figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=9)

@@ -21,8 +21,12 @@ from mvrecon_bench.rows import Bench, Job, Row, markdown, number, skipped
 #: Varied quantity -> setting, and the exponent of the setting in the amount of work.
 AXES = {"voxels": ("n", 3), "rays": ("pixels", 2)}
 AXES |= {name: (name, 1) for name in ("views", "batch", "channels", "threads")}
-#: What the picture calls them, where the name says less.
-TOLD = {"rays": "rays per view", "batch": "volumes in a batch", "channels": "channels of a volume"}
+#: Labels of the picture's axes, where they say more than the name.
+AXIS_LABELS = {
+    "rays": "rays per view",
+    "batch": "volumes in a batch",
+    "channels": "channels of a volume",
+}
 CALLS = ("forward", "adjoint")
 
 
@@ -141,7 +145,7 @@ class Scaling(Bench):
         panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
         fits = []
         for (label, axis, call), points in series(rows).items():
-            panels.setdefault(TOLD.get(axis, axis), {})[f"{label} {call}"] = points
+            panels.setdefault(AXIS_LABELS.get(axis, axis), {})[f"{label} {call}"] = points
             p, error = exponent(points)
             span = f"{points[0][0]:g} to {points[-1][0]:g}"
             fits.append((label, axis, call, span, f"{p:.2f}", f"{error:.2f}".replace("nan", "")))

@@ -50,7 +50,7 @@ class Bed:
 
     Args:
         volume: the volume, on its device.
-        grid: its grid.
+        grid: grid of the volume.
         cameras: the rig.
         method: method of the projector.
         support: the voxels that may be nonzero; None: the nonzero voxels.
@@ -171,8 +171,8 @@ TASKS: dict[str, Callable[[Bed, str], SkipTrial]] = {
     **{"forward": forward, "forward_static": forward_static, "adjoint": adjoint},
     f"sirt{ITERATIONS}": reconstruction,
 }
-#: What each does, for the picture.
-TOLD = {
+#: Titles of the picture's panels by task.
+TITLES = {
     "forward": "projection, with the search for voxels",
     "forward_static": "projection within a given support",
     "adjoint": "back-projection into a given support",
@@ -329,19 +329,19 @@ def difference(result: Tensor, reference: Tensor | None) -> Row:
     return {"error": (result - reference).abs().max().item(), "differing": int((a != b).sum())}
 
 
-def _filled(row: Row) -> str:
-    """A scene's name, with the share of voxels that it fills in place of digits, where known."""
+def _scene_label(row: Row) -> str:
+    """The name of a scene, with the share of its non-zero voxels in place of digits, if known."""
     name, share = row["scene"].replace("_", " "), number(row, "occupancy")
     return name if math.isnan(share) else f"{name.rstrip('0123456789')}, {100 * share:.0f} %"
 
 
 def panels(rows: Iterable[Row]) -> dict[str, dict[str, list[tuple[str, float]]]]:
-    """What a task does -> baseline -> (scene, speed-up) for every rig and method, in mode auto."""
+    """Title of a task -> baseline -> (scene, speed-up) for every rig and method, in mode auto."""
     curves: dict[str, dict[str, list[tuple[str, float]]]] = {}
     for row in rows:
         if row["mode"] == "auto":
-            kinds = curves.setdefault(TOLD[row["task"]], {text: [] for text in AGAINST.values()})
+            kinds = curves.setdefault(TITLES[row["task"]], {text: [] for text in AGAINST.values()})
             for name, text in AGAINST.items():
                 if (times := number(row, name)) == times:
-                    kinds[text].append((_filled(row), times))
+                    kinds[text].append((_scene_label(row), times))
     return {task: kinds for task, kinds in curves.items() if all(kinds.values())}

@@ -288,7 +288,7 @@ def frame_numbers(image: DicomImage, name: str) -> list[int]:
         values = [int(v) for v in np.atleast_1d(value)]
     if len(values) != frames or min(values) < 1:
         raise Refused(
-            f"{image.path}: expected {name} of {frames} numbers from 1 on, one a frame, got "
+            f"{image.path}: expected {name} of {frames} numbers from 1 on, one per frame, got "
             f"{len(values)}"
         )
     return values
@@ -406,8 +406,8 @@ def _alike(name: str, one: Any, other: Any) -> bool:
 
 
 def _check_durations(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
-    """Raise if the image's frame duration is none of its rotations' or phases', or that of a
-    rotation of several views none of its phases'.
+    """Raise for frame durations that contradict one another: the image's is none of its rotations'
+    or phases', or that of a rotation of several views is none of its phases'.
     """
     name, rotation = "ActualFrameDuration", "RotationInformationSequence"
     groups = {"the image": [dataset]}
@@ -419,7 +419,7 @@ def _check_durations(path: Path, dataset: Any, views: Sequence[tuple[int, int, i
     turns = len({view[2] for view in views}) > 1
     for (place, own), (other, found) in combinations(stated.items(), 2):
         if place == rotation and not turns:
-            continue  # of a file that was made from a tomogram's
+            continue  # one view, as of a file that was made from a tomogram's
         if own and found and not any(same(a, b) for a in own for b in found):
             raise Refused(
                 f"{path}: expected the {name} of {place} in {other}, got {shown(own)} and "
@@ -482,7 +482,7 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
 
 
 def _seconds(item: Any) -> float | None:
-    """Duration of a frame in s; None if the item has none, or 0, as some programs write."""
+    """Duration of a frame in s; None if the item states none, or 0, as some programs write."""
     if (duration := _number("ActualFrameDuration", item, 0, 1)) is not None and duration < 0:
         raise ValueError(f"ActualFrameDuration is not negative, got {duration:g} ms")
     return duration / 1000 if duration else None

@@ -150,8 +150,8 @@ def _duration(path: Path, views: Sequence[View]) -> float | None:
 def _starts(
     views: Sequence[View], frames: Sequence[Frame], moment: int, duration_s: float
 ) -> list[float] | None:
-    """The start of each view in s since that of the measurement; None if unknown: of frames without
-    phases, or of several angular views, which may follow one another in each frame.
+    """The start of each view in s since that of the measurement. None if unknown: for frames
+    without phases, and for frames of several angular views, which may follow one another.
     """
     turns = sorted({(view.rotation, view.number) for view in views})
     first = frames[moment].start_s

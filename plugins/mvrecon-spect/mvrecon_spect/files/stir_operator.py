@@ -42,7 +42,7 @@ def operator_of(
         mu: linear attenuation in 1/mm, as in `Spect`.
         blur: model the blur by the holes and by the detector's intrinsic resolution.
         world: axes of the files; see `cameras_of`.
-        shared: as in `Spect`.
+        shared: see `Spect`.
 
     Pixels outside a hole's acceptance angles receive no counts from it; this cut is applied after
     the blur. STIR's files do not describe penetration of the edge.
@@ -74,7 +74,7 @@ def stir_projector(
             is assigned to the nearest hole.
         path, detector_file, collimator_file, world: see `stir_pinhole`.
         blur: see `operator_of`.
-        mu, shared: as in `Spect`.
+        mu, shared: see `Spect`.
 
     Raises:
         ValueError: cameras at other positions; see `operator_of` and `stir_pinhole`.

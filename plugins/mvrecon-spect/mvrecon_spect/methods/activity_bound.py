@@ -49,7 +49,7 @@ def support_of_counts(
     Args:
         counts: raw counts, whole numbers, without subtraction.
         cameras, grid: the rig and the voxels.
-        sensitivity: as in `activity_bound`.
+        sensitivity: see `activity_bound`.
         tolerance: activity, in the unit of the sensitivity, below which a brick is empty.
         delta: probability of at least one incorrect brick in a scene; each item of a batch is a
             scene.
@@ -79,7 +79,7 @@ def activity_bound(
     least of a fixed family of sets of views (`view_sets`); infinite where no view has sensitivity.
 
     Args:
-        counts, cameras, grid, brick: as in `support_of_counts`.
+        counts, cameras, grid, brick: see `support_of_counts`.
         sensitivity: expected counts of each view per unit of activity in a whole brick, as from
             `brick_sensitivity`. It must cover only pixels of the brick's footprint (not the tails
             of a wide point spread), and be a lower bound: with the least possible transmission of a

@@ -24,7 +24,7 @@ from mvrecon_spect.methods.corrections import (
 
 #: Relative difference of two durations, above that by rounding.
 MAX_DURATION_DIFFERENCE = 1e-3
-#: Photons per decay in one window, at most: two of an annihilation, and some more.
+#: Most photons per decay in one energy window: two of an annihilation, and some margin.
 MAX_PHOTONS = 4
 
 
@@ -65,7 +65,7 @@ def detector(
 
     Raises:
         Refused: a duration, starts or a share that are missing, of another number, or contradict
-            the file; an option that has no effect without another; photons per decay in per cent.
+            the file; an option without the one that it belongs to; photons per decay in per cent.
         ValueError: see `uniformity_factors`, `live_factors` and `decay_factors`.
     """
     count, where = views.n_views, views.options.path

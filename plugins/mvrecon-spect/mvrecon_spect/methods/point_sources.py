@@ -149,8 +149,8 @@ def image_widths(
     Args:
         views: counts of each source, without background.
         points: positions in mm.
-        cameras: such as of `fit_point_sources`.
-        hole: its sensitivity is that of efficiency one.
+        cameras: the pinholes, such as of `fit_point_sources`.
+        hole: pinhole whose sensitivity is that of efficiency one.
         least_counts: least number of counts of an image.
         photons: emitted in the measurement, of each source; adds the `efficiency` and the hole's
             `area_mm2`.

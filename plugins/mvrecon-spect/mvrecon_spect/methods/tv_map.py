@@ -40,7 +40,7 @@ def tv_map(
 
     Args:
         A: the operator, in counts per unit of the volume.
-        counts: measured.
+        counts: measured counts.
         iterations: number of iterations, each over all counts.
         weight: weight of the total variation, in mm; c is the mean sensitivity of the visible
             voxels, so f(a y) = a f(y): longer measurements are not smoothed more. 1e-3 to 1 is

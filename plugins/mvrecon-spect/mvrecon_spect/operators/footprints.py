@@ -24,11 +24,7 @@ from mvrecon.data.resample import resample
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid
-from mvrecon.kernels.operator import (
-    accumulation_dtype,
-    choose_backend,
-    to_accumulation_dtype,
-)
+from mvrecon.kernels.operator import accumulation_dtype, choose_backend, to_accumulation_dtype
 from mvrecon.kernels.self_test import Errors
 from mvrecon.operators.memo import FixedGeometry, grid_key, kept
 from mvrecon.operators.operator import (

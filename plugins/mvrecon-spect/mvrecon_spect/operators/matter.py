@@ -113,7 +113,7 @@ def _doubt(values: Float[Tensor, "d h w"], name: str) -> None:
 
 
 def _warn_of_cut(values: Float[Tensor, "d h w"], source: Grid, grid: Grid, name: str) -> None:
-    """Warn about a map at whose end there is matter, while the grid goes on."""
+    """Warn about a map that ends in matter before the grid ends."""
     low, high = source.to_index(grid.corners()).aminmax(dim=0)
     for axis, (n, step) in enumerate(zip(source.size, source.spacing, strict=True)):
         for end, beyond in ((0, -0.5 - low[axis]), (n - 1, high[axis] - n + 0.5)):

@@ -46,9 +46,9 @@ class Shared(TypedDict, total=False):
             crystal, or the path of a table, see `response_of`.
         method: "footprints" of voxels, see `Footprints`; or "joseph": the thin ray of each pixel's
             centre, see `Drr`, for plain views of fine voxels and lists of bins.
-        backend: as in `RayTransform`.
-        skip: as in `RayTransform`; only with thin rays.
-        support: as in `RayTransform`.
+        backend: see `RayTransform`.
+        skip: see `RayTransform`; only with thin rays.
+        support: see `RayTransform`.
         collimator_mu: linear attenuation of the collimator in 1/mm, see `Hole`.
         opening_degrees: full opening angle of the edge, see `Hole`.
         acceptance_degrees: maximum angle of a ray to the pinhole's axis, see `Hole`.
@@ -183,7 +183,7 @@ class OfCases(Wrapped):
 OBJECT = 0.8
 #: Cells per axis of a grid's box whose centres are tested for visibility by the pinholes.
 COARSE = 32
-#: Tolerance of the width of a pixel in voxels, and cosine of the angle between rows and columns.
+#: Tolerance of the width of a pixel in voxels, and of the cosine between rows and columns.
 WIDER, SKEW = 1e-6, 0.01
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")

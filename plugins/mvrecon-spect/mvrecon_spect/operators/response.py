@@ -65,14 +65,15 @@ ResponseOption = Literal["geometric"] | str | Path | Mapping[str, Any]
 ANGLES = 33
 #: Least difference of magnifications, relative to the greatest, and of angles in degrees, for a
 #: further term of a table's polynomials.
-APART, DEGREES_APART = 0.05, 3.0
-#: Magnifications beyond those of a table, as a ratio, from which a warning is given; points of a
-#: grid, along each axis, where its polynomials are evaluated.
-MAX_BEYOND, PLACES = 1.25, 9
+MIN_STEP, MIN_STEP_DEGREES = 0.05, 3.0
+#: Ratio of a grid's magnifications to those of a table from which a warning is given.
+MAX_EXTRAPOLATION = 1.25
+#: Points along each axis of a grid where a table's polynomials are evaluated.
+GRID_POINTS = 9
 #: Columns of a table of a measured response.
 TABLE = ("depth_mm", "angle_degrees", "fwhm_radial_mm", "fwhm_tangential_mm")
 OPTIONAL = ("distance_mm", "efficiency", "area_mm2")
-#: Relative difference of the areas of a hole, for rounding.
+#: Relative difference of a hole's area in a table and by its diameter, for rounding.
 MAX_AREA_DIFFERENCE = 0.01
 
 
@@ -92,8 +93,8 @@ def response_of(
             the path of a table, see `measured`.
         hole: a pinhole with its penetration.
         cameras: the pinholes.
-        grid: the voxels, which a table must cover.
-        blur: whether there is any.
+        grid: voxels for which a table needs a response.
+        blur: whether the response blurs.
         intrinsic_mm: FWHM of the detector's intrinsic resolution.
 
     Raises:
@@ -205,40 +206,31 @@ def _least_cosine(cameras: Cameras) -> float:
     return min((cameras.distance.detach() / away).min().item(), 1 - 1e-6)
 
 
-def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
-    """Coefficients of 1, t, .. that fit values best."""
-    return _solved(torch.stack([t**n for n in range(terms)], dim=1), values)
+def _powers(t: Float[Tensor, " n"], count: int) -> Float[Tensor, "n k"]:
+    """1, t, .. of each value."""
+    return torch.stack([t**n for n in range(count)], dim=1)
 
 
-def _solved(rows: Float[Tensor, "n k"], values: Float[Tensor, " n"]) -> Float[Tensor, " k"]:
-    """Least squares."""
+def _terms(m: Float[Tensor, " n"], t: Float[Tensor, " n"]) -> Float[Tensor, "n 6"]:
+    """1, m, m^2, t, t m, t m^2 of each point, as in `Response`."""
+    return torch.cat([_powers(m, 3), t[:, None] * _powers(m, 3)], dim=1)
+
+
+def _least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, " n"]) -> Float[Tensor, " k"]:
+    """Coefficients of the columns that fit values best."""
     return torch.linalg.lstsq(rows, values[:, None]).solution[:, 0]
 
 
-def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
-    """A response from widths of the images of point sources, of Gaussian shape.
+def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
+    """Coefficients of 1, t, .. that fit values best."""
+    return _least_squares(_powers(t, terms), values)
 
-    Args:
-        path: a table with a row for each source: its distance `depth_mm` from the hole's plane and
-            `angle_degrees` from the axis, `fwhm_radial_mm` and `fwhm_tangential_mm` of its image on
-            the detector, and optionally `efficiency`, counts over those of the law, `area_mm2`,
-            that of the hole in this law, which is compared, and
-            `distance_mm` l from hole to detector, if that is not of all cameras. Variances are
-            fitted in l / depth and 1 - cos, of as many terms as there are depths and
-            angles that differ by `APART` and `DEGREES_APART`, at most three and two, and fewer
-            where the variances were not positive in the whole grid.
-        hole: its sensitivity is the law's.
-        cameras: a rig with one distance from hole to detector, unless the table has it.
-        grid: the voxels.
+
+def _read_table(path: Path, cameras: Cameras) -> dict[str, Float[Tensor, " n"]]:
+    """The columns of a table of a measured response, with `distance_mm`; see `measured`.
 
     Raises:
-        ValueError: missing or unknown columns, impossible values, several distances, efficiencies
-            of another hole, or widths or
-            efficiencies of voxels in a detector's field that are not positive, beyond the table's
-            depths and angles.
-
-    Warns:
-        UserWarning: voxels far beyond the table's depths.
+        ValueError: missing or unknown columns, impossible values, or several distances.
     """
     rows = list(csv.DictReader(text_of(path).splitlines()))
     names = set(rows[0]) if rows else set()
@@ -246,27 +238,54 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
         known, got = ", ".join((*TABLE, *OPTIONAL)), ", ".join(sorted(names))
         raise ValueError(f"{path}: expected a table of {known}, got {got}")
     try:
-        columns = {name: [float(row[name]) for row in rows] for name in names}
+        columns = {
+            name: torch.tensor([float(row[name]) for row in rows], dtype=torch.float64)
+            for name in names
+        }
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: expected numbers in all columns, got {error}") from error
-    depth, angle, radial, tangential = (
-        torch.tensor(columns[name], dtype=torch.float64) for name in TABLE
-    )
-    lengths = cameras.distance.detach()
-    if "distance_mm" in names:
-        lengths = torch.tensor(columns["distance_mm"], dtype=torch.float64)
-    elif (lengths - lengths[0]).abs().max() > 1e-3 * lengths[0]:
-        raise ValueError(
-            f"{path}: expected cameras with one distance from hole to detector, or distance_mm in "
-            f"the table"
-        )
-    else:
-        lengths = lengths[0].expand_as(depth)
-    positive = torch.stack([depth, radial, tangential, lengths])
-    numbers = torch.tensor([*columns.values()], dtype=torch.float64)
-    if not (positive > 0).all() or not (angle.abs() < 90).all() or not numbers.isfinite().all():
+    if "distance_mm" not in names:
+        lengths = cameras.distance.detach()
+        if (lengths - lengths[0]).abs().max() > 1e-3 * lengths[0]:
+            raise ValueError(
+                f"{path}: expected cameras with one distance from hole to detector, or distance_mm "
+                f"in the table"
+            )
+        columns["distance_mm"] = lengths[0].expand(len(rows))
+    finite = all(column.isfinite().all() for column in columns.values())
+    in_mm = [name for name in (*TABLE, "distance_mm") if name.endswith("mm")]
+    positive = all((columns[name] > 0).all() for name in in_mm)
+    if not (finite and positive and (columns["angle_degrees"].abs() < 90).all()):
         raise ValueError(f"{path}: expected finite, positive mm, and angles below 90 degrees")
-    for area in set(columns.get("area_mm2", ())):
+    return columns
+
+
+def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
+    """A response from widths of the images of point sources, of Gaussian shape.
+
+    Variances are fitted in l / depth and 1 - cos, by as many terms as there are depths and angles
+    that differ by `MIN_STEP` and `MIN_STEP_DEGREES`, at most three and two; by fewer terms where a
+    fit is not positive at all voxels in a detector's field.
+
+    Args:
+        path: a table with a row for each source: its distance `depth_mm` from the hole's plane and
+            `angle_degrees` from the axis, and `fwhm_radial_mm` and `fwhm_tangential_mm` of its
+            image on the detector. Optional: `efficiency`, counts over those of the law for a hole
+            of `area_mm2`; and `distance_mm` l from hole to detector, if the cameras have several.
+        hole: the hole of the operator, whose area is compared with the table's.
+        cameras: a rig with one distance from hole to detector, unless the table has it.
+        grid: voxels for which the response must be positive.
+
+    Raises:
+        ValueError: missing or unknown columns, impossible values, several distances, efficiencies
+            of another hole, or no fit with positive widths and efficiencies at all voxels in a
+            detector's field.
+
+    Warns:
+        UserWarning: voxels far beyond the table's depths.
+    """
+    columns = _read_table(path, cameras)
+    for area in set(columns.get("area_mm2", torch.empty(0)).tolist()):
         if not abs(area / hole.area_mm2 - 1) <= MAX_AREA_DIFFERENCE:
             raise ValueError(
                 f"{path}: expected the hole of its efficiencies, of {area:g} mm^2 "
@@ -274,38 +293,43 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
                 f"{hole.area_mm2:.4g} mm^2 with its penetration; set the diameter, and no "
                 f"collimator_mu, which measured efficiencies contain"
             )
-    m, cosine = lengths / depth, torch.deg2rad(angle).cos()
+    depth, angle, radial, tangential = (columns[name] for name in TABLE)
+    m, cosine = columns["distance_mm"] / depth, torch.deg2rad(angle).cos()
     t, tangent2 = 1 - cosine, 1 / cosine**2 - 1
-    depths, angles = _apart(m, APART * m.max().item()), _apart(angle.abs(), DEGREES_APART)
-    terms = torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1)
-    field = _field(cameras, grid)
+    depths, angles = (
+        _distinct(m, MIN_STEP * m.max().item()),
+        _distinct(angle.abs(), MIN_STEP_DEGREES),
+    )
+    terms, field = _terms(m, t), _field(cameras, grid)
     _warn_of_depths(path, m, field.terms[:, 1])
 
     def widths(orders: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Coefficients of variances by so many terms of the depth and of the angle."""
         used = [3 * j + i for j in range(orders[1]) for i in range(orders[0])]
         detector, smear = torch.zeros(2, 6, dtype=torch.float64)
-        detector[used] = _solved(terms[:, used], (tangential / FWHM) ** 2)
-        if angle.abs().max() >= DEGREES_APART:  # on the axis, radial is no direction
+        detector[used] = _least_squares(terms[:, used], (tangential / FWHM) ** 2)
+        if angle.abs().max() >= MIN_STEP_DEGREES:  # on the axis, radial is no direction
             rows = terms[:, used] * tangent2[:, None]
-            smear[used] = _solved(rows, (radial**2 - tangential**2) / FWHM**2)
+            smear[used] = _least_squares(rows, (radial**2 - tangential**2) / FWHM**2)
         return detector, smear
 
     orders = product(range(min(depths, 3), 0, -1), range(min(angles, 2), 0, -1))
     fits = map(widths, sorted(orders, key=sum, reverse=True))
     detector, smear = _first_positive(path, "widths", fits, lambda fit: field.variances(*fit))
     efficiency = torch.tensor([1.0, 0.0, 0.0])
-    if "efficiency" in columns:
-        values = torch.tensor(columns["efficiency"], dtype=torch.float64)
+    if (values := columns.get("efficiency")) is not None:
         counts = range(min(angles, 3), 0, -1)
         fits = (F.pad(_polynomial(t, values, count), (0, 3 - count)) for count in counts)
         efficiency = _first_positive(path, "efficiencies", fits, field.efficiencies)
-    parts = (tuple(part.tolist()) for part in (detector, smear, efficiency))
-    return Response(**dict(zip(("detector", "radial", "efficiency"), parts, strict=True)))
+    return Response(
+        detector=tuple(detector.tolist()),
+        radial=tuple(smear.tolist()),
+        efficiency=tuple(efficiency.tolist()),
+    )
 
 
-def _apart(values: Float[Tensor, " n"], least: float) -> int:
-    """How many of the values, from the least up, differ by so much from the one before."""
+def _distinct(values: Float[Tensor, " n"], least: float) -> int:
+    """The number of values, from the lowest up, that differ by so much from the one before."""
     count, last = 0, -math.inf
     for value in values.sort().values.tolist():
         if value - last >= least:
@@ -314,8 +338,11 @@ def _apart(values: Float[Tensor, " n"], least: float) -> int:
 
 
 class _Field(NamedTuple):
-    """Points of a grid in the field of a detector: 1, m, m^2, t, t m, t m^2 of each, and its
-    squared tangents along u and v.
+    """Points of a grid in the field of a detector.
+
+    Args:
+        terms: 1, m, m^2, t, t m, t m^2 of each point.
+        tangents2: squared tangents of its angle along u and v.
     """
 
     terms: Float[Tensor, "p 6"]
@@ -327,14 +354,14 @@ class _Field(NamedTuple):
         return (terms @ detector)[:, None] + (terms @ radial)[:, None] * self.tangents2
 
     def efficiencies(self, coefficients: Float[Tensor, "3"]) -> Float[Tensor, " p"]:
-        """By 1, t, t^2."""
+        """Counts per photon that passes the hole, by the coefficients of 1, t, t^2."""
         t = self.terms[:, 3]
-        return torch.stack([t**0, t, t**2], dim=1) @ coefficients.to(t)
+        return _powers(t, 3) @ coefficients.to(t)
 
 
 def _field(cameras: Cameras, grid: Grid) -> _Field:
-    """Points of a grid, before all pinholes in whose detector's field they are."""
-    axes = [torch.linspace(0, n - 1, PLACES, dtype=torch.float64) for n in grid.size]
+    """The points of a grid that a detector sees, one for each pinhole that images it."""
+    axes = [torch.linspace(0, n - 1, GRID_POINTS, dtype=torch.float64) for n in grid.size]
     images = cameras.project(grid.to_world(torch.cartesian_prod(*axes)).to(cameras.source))
     pixels, length = images.detach()[..., :2], cameras.distance.detach()[:, None]
     end = pixels.new_tensor(cameras.shape[::-1]) - 0.5
@@ -344,7 +371,7 @@ def _field(cameras: Cameras, grid: Grid) -> _Field:
     tangents = beam @ (steps / steps.norm(dim=-1, keepdim=True)).mT / length[..., None]
     m = (-length / images.detach()[..., 2])[seen]
     t = (1 - length / beam.norm(dim=-1))[seen]
-    return _Field(torch.stack([m**0, m, m**2, t, t * m, t * m**2], dim=1), tangents[seen] ** 2)
+    return _Field(_terms(m, t), tangents[seen] ** 2)
 
 
 def _warn_of_depths(path: Path, known: Float[Tensor, " n"], asked: Float[Tensor, " p"]) -> None:
@@ -352,7 +379,7 @@ def _warn_of_depths(path: Path, known: Float[Tensor, " n"], asked: Float[Tensor,
     if not asked.numel():
         return
     (low, high), (least, most) = known.aminmax(), asked.aminmax()
-    if most > MAX_BEYOND * high or MAX_BEYOND * least < low:
+    if most > MAX_EXTRAPOLATION * high or MAX_EXTRAPOLATION * least < low:
         warnings.warn(
             f"{path}: expected sources at the depths of the grid, of magnifications l / depth of "
             f"{least:.3g} to {most:.3g}, got {low:.3g} to {high:.3g}; widths are extrapolated",

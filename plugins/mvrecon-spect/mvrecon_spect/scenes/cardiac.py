@@ -113,7 +113,7 @@ class Heart:
         length: distance from the base to the outer apex.
         wall: wall thickness of the left ventricle.
         right_width: width of the right ventricle, outward from the left one.
-        right_wall: its wall thickness.
+        right_wall: wall thickness of the right ventricle.
         defect: defect in the left ventricle's wall.
 
     Raises:
