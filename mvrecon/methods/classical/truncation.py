@@ -250,7 +250,8 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
         return ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise
 
     shown = beyond(air)
-    flat = _flat_air(*(torch.where(shown, x, torch.nan) for x in (ends, nexts)), top)
+    edge, beside = (torch.where(shown, x, torch.nan) for x in (ends, nexts))
+    flat = _flat_air(edge, beside, top)
     cut = beyond(torch.maximum(air, flat)).any(dim=2)
     either = not (cut.double().mean(dim=0) > WARNED_VIEWS).any()
     if either:
@@ -260,14 +261,14 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     named = views[worst] > WARNED_VIEWS
     if not named.any():
         return
-    edge = ends.amax(dim=2)[:, worst][cut[:, worst]].mean().item()
+    height = ends.amax(dim=2)[:, worst][cut[:, worst]].mean().item()
     where, rows = f"{views[worst].max().item():.0%} of them", named.double().mean().item()
     where = where if rows == 1 else f"{where} and in {rows:.0%} of their rows"
-    off = 1 - math.exp(-edge)
+    off = 1 - math.exp(-height)
     what = f"a wide, weak object, or their flat field is {off:.0%} off" if either else "the object"
     warnings.warn(
         f"Views end inside {what}: in {where} line integrals at a side of the detector are "
-        f"above noise and what air reads, in the mean {edge / most[worst].item():.0%} of the "
+        f"above noise and what air reads, in the mean {(height / most[worst]).item():.0%} of the "
         f"greatest ones, or of {MAX_LEVEL:g} times their mean. "
         + (
             "Their rows are continued as those of ellipses: values inside the field of all views "
