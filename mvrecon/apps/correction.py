@@ -41,8 +41,9 @@ from mvrecon.operators.operator import LinearOperator
 
 #: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
 MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
-#: Share of the line integrals beside the grid from which on the object extends beyond it.
-MAX_BESIDE = 0.02
+#: Share of the line integrals beside the grid from which on the object extends beyond it: views of
+#: a ball are aligned on a grid that misses 0.001 of them, and no longer where it misses 0.016.
+MAX_BESIDE = 0.005
 #: Arrays of the views' size that a fit holds.
 HELD_ARRAYS = 8
 #: f(A, views) -> aligned views, and the errors of their cameras.
@@ -93,6 +94,9 @@ def corrected_scan(
 ) -> tuple[Scan, Alignment]:
     """The scan with aligned views, and the errors of its cameras.
 
+    Views are aligned on the scan's grid, or where the object extends beyond it, in the field of
+    half of the views, in at most `MAX_GRID_VOXELS` voxels a side.
+
     Raises:
         ValueError: pixels that were not measured; as `self_aligned`.
 
@@ -106,7 +110,9 @@ def corrected_scan(
             f"saturated ones; crop them by views.rows and views.columns"
         )
     views = whole.views[None, None].to(device)
-    corrected, by = align(scan.operator().to(device), views)
+    box = _holding(scan, views)
+    grid = scan.grid if box is scan.grid else coarse(box, MAX_GRID_VOXELS)
+    corrected, by = align(replace(scan, grid=grid).operator().to(device), views)
     by = by.to("cpu")
     warn_unless_aligned(by)
     if self_calibrate:
@@ -135,15 +141,13 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     bar.phase("reading")
     whole = scan.measured.whole()
     pixels = _filled(whole, 1, scan.counts)
-    cut, box = cut_sides(pixels), scan.grid
+    axis = conjugate_axis(scan.cameras, pixels, scan.grid) if "offset_u" in free else KEPT
+    about = replace(scan, cameras=scan.cameras.shifted(torch.tensor([[axis.offset, 0.0]])))
+    cut, box = cut_sides(pixels), _holding(about, pixels.to(device))
 
     def operator_of(grid, cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
 
-    axis = conjugate_axis(scan.cameras, pixels, box) if "offset_u" in free else KEPT
-    about = scan.cameras.shifted(torch.tensor([[axis.offset, 0.0]]))
-    if share_beside(operator_of(coarse(box, MAX_GRID_VOXELS), about), pixels) > MAX_BESIDE:
-        box = extended_to_field(about, box)
     box = _grown(box) if cut.all(dim=-1).any() else box
     grid = coarse(box, MAX_GRID_VOXELS)
     joined = _joined(scan, grid)
@@ -273,6 +277,15 @@ def calibration_table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]
         "settled": estimate.settled,
         "uncertainty": estimate.uncertainty,
     }
+
+
+def _holding(scan: Scan, pixels: Float[Tensor, "1 1 m v u"]) -> Grid:
+    """The scan's grid, or the field of half of its views where the object extends beyond it."""
+    A = PROJECTORS.from_config(
+        scan.projector, grid=coarse(scan.grid, MAX_GRID_VOXELS), cameras=scan.cameras
+    )
+    beside = share_beside(A.to(pixels.device), pixels)
+    return extended_to_field(scan.cameras, scan.grid) if beside > MAX_BESIDE else scan.grid
 
 
 def _grown(grid: Grid) -> Grid:

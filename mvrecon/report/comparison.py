@@ -77,7 +77,7 @@ def read(places: Iterable[str | Path]) -> list[Row]:
 
     Raises:
         FileNotFoundError: a path without a finished run.
-        Refused: a file that is not a run's.
+        Refused: a file that is not a run's; tables without a method.
     """
     folders: dict[Path, None] = {}
     for place in places:
@@ -92,6 +92,8 @@ def read(places: Iterable[str | Path]) -> list[Row]:
         table = read_results(folder)
         with file_errors(folder / RESULTS, "is no table of results"):
             rows += rows_of(table, name, folder)
+    if not rows:
+        raise Refused(f"{', '.join(map(str, folders))}: expected tables of methods, got none")
     return rows
 
 
@@ -382,10 +384,7 @@ def front(rows: Sequence[Row], metric: str) -> list[Row]:
 
 def picture(rows: Sequence[Row], metric: str = "psnr") -> str:
     """Plot every method's finite figure of merit against its milliseconds (logarithmic), with the
-    Pareto front as a line; SVG.
-
-    Raises:
-        ValueError: no method with a time and a figure.
+    Pareto front as a line; SVG. Without any, as of runs whose volumes all failed, it is empty.
     """
     from matplotlib import rc_context
     from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -393,8 +392,6 @@ def picture(rows: Sequence[Row], metric: str = "psnr") -> str:
 
     timed = [row for row in rows if row.ms > 0]
     shown = [row for row in timed if math.isfinite(row.mean(metric))]
-    if not shown:
-        raise ValueError(f"Expected methods with a time and a {metric}, got none")
     drawing = Figure((8, 4.5), layout="constrained")
     axes = drawing.add_subplot(xscale="log", xlabel="time of a reconstruction, ms", ylabel=metric)
     best = [row for row in front(timed, metric) if row in shown]

@@ -135,6 +135,15 @@ def test_equal_volumes_have_infinite_psnr_not_missing(tmp_path):
     assert [row.method for row in comparison.front([sirt, one, two], "psnr")] == ["exact"]
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_tables_without_a_finite_figure_are_written_with_an_empty_picture(value, tmp_path):
+    """Of methods that all failed, or whose volumes all equal the truth."""
+    run(tmp_path / "run", {}, net=([value] * 4, 3.0), sirt=([value] * 4, None))
+    compare.compare([tmp_path / "run"], out=tmp_path / "out")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {*compare.TABLE_FILES}
+    assert ">net<" not in (tmp_path / "out" / "pareto.svg").read_text()
+
+
 def test_a_foreign_table_is_refused_or_only_shown(tmp_path, capsys):
     """A file of results that is damaged is refused by name, and one with markup in a label shows it
     as text.
@@ -146,6 +155,9 @@ def test_a_foreign_table_is_refused_or_only_shown(tmp_path, capsys):
     (folder / "results.json").write_text('{"methods": {"a": 3}}')
     with pytest.raises(Refused, match="results.json: is no table of results"):
         read([folder])
+    (folder / "results.json").write_text('{"scenes": [], "methods": {}}')
+    with pytest.raises(Refused, match="expected tables of methods, got none"):
+        compare.compare([folder])
     with pytest.raises(FileNotFoundError, match="Expected a finished run"):
         read([tmp_path / "out"])
 

@@ -111,7 +111,7 @@ def _opened(
 
 
 def _expected() -> str:
-    endings = [*ENDINGS, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())]
+    endings = dict.fromkeys([*ENDINGS, ".dcm", *(f".{ending}" for ending in VIEW_FILES.names())])
     return (
         f"a folder of TIFF, PNG, DICOM or RTK's images, or a file that ends in {', '.join(endings)}"
     )

@@ -43,8 +43,8 @@ MIN_DEVIATIONS, WARNED_VIEWS = 3.0, 0.1
 #: The same of the first and the last row of any group of views, and the standard deviations that
 #: none of hundreds of means exceeds by chance.
 ROW_EDGE, ROW_DEVIATIONS = 0.02, 5.0
-#: What air reads is the lower quartile of the edges, up to a flat field that is a tenth off, and
-#: less than this part of the greatest line integral.
+#: What air reads is the lower quartile of the edges, or what a flat field does that is a tenth off
+#: at most, and this part of the greatest line integral.
 AIR_QUANTILE, MAX_AIR, MAX_AIR_SHARE = 0.25, 0.1, 0.5
 #: Numbers of the parts of `edges_of`.
 PARTS = [2, 2, 2, 1, 1, 2]
@@ -114,7 +114,7 @@ def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
 
 def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
     """Whether an object reaches the first or the last row of any group of views: a mean over a
-    block of their columns is above noise and above what air reads, the lowest of these means.
+    block of their columns is above noise and above what air reads, the lowest mean of that row.
 
     Args:
         edges: edges of the views' columns, `edges_of(views.mT)`.
@@ -125,7 +125,7 @@ def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
     noise = noise / math.sqrt(_per_group(edges))
     # that of sixteen pixels is half as much by chance somewhere
     noise = torch.maximum(noise, noise.movedim(1, 0).flatten(1).median(dim=1).values[:, None, None])
-    lowest = ends.amin(dim=(0, 2, 3))[:, None, None]
+    lowest = ends.amin(dim=3, keepdim=True)
     air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
     return bool((ends - air > ROW_EDGE * top + ROW_DEVIATIONS * noise).any())
 
@@ -205,37 +205,35 @@ def _parabola(
     return value, slope + 2 * curvature * end, curvature
 
 
-def _air(
+def _flat_air(
     ends: Float[Tensor, "g k n i"], nexts: Float[Tensor, "g k n i"], top: Float[Tensor, "k 1 1"]
-) -> tuple[Float[Tensor, "k n 1"], Float[Tensor, "k n 1"]]:
-    """What air reads at each side: what the lowest edges of its groups of views and rows do, or
-    zero if that is too high for air; and the same if a flat field may be off by up to a tenth.
+) -> Float[Tensor, "k n 1"]:
+    """What a flat field that is off, or that drifts, may read at the edges of each side that show
+    something: up to `MAX_AIR` and to `MAX_AIR_SHARE` of the greatest line integral, if these edges
+    are as flat as air's, else zero.
 
-    It is air's if it is a small part of the greatest line integral. It may be that of a flat field
-    which is off if the edges are as flat as air's: they grow inwards by less than a half of what an
-    ellipse of the greatest line integral does, whose squared line integrals are a parabola.
+    They are if they grow inwards by less than a half of what an ellipse of the greatest line
+    integral does, whose squared line integrals are a parabola.
 
     Args:
-        ends, nexts: the outermost columns and those beside them; NaN: not seen.
+        ends, nexts: the outermost columns and those beside them; NaN: they show nothing.
         top: the greatest line integral.
     """
-    flat = [x.permute(1, 2, 0, 3).flatten(2) for x in (ends, nexts)]
-    lowest = flat[0].nanquantile(AIR_QUANTILE, dim=2, keepdim=True).nan_to_num(0).clamp_min(0)
-    growth = (flat[1] - flat[0]).nanmedian(dim=2, keepdim=True).values
+    sides = (x.permute(1, 2, 0, 3).flatten(2) for x in (ends, nexts - ends))
+    height, growth = (x.nanmedian(dim=2, keepdim=True).values for x in sides)
     inwards = 2 * (1 + BESIDE) * OUTERMOST  # twice the way in units of a half row
-    ellipse = (lowest.square() + (top.square() - lowest.square()) * inwards).sqrt() - lowest
-    off = (lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top) & (growth < ellipse / 2)
-    low = lowest < CUT_EDGE * top
-    return torch.where(low, lowest, 0), torch.where(low | off, lowest, 0)
+    ellipse = (height.square() + (top.square() - height.square()) * inwards).sqrt() - height
+    return (growth < ellipse / 2) * (MAX_AIR_SHARE * top).clamp_max(MAX_AIR)
 
 
 def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) -> None:
     """Warn of views that end inside the object, whose jump at the edge the ramp filter takes for
     a part of the object, or whose continuation is a guess.
 
-    An edge shows an object if it is above what air reads there, see `_air`, and above the noise of
-    a group of views. Flat edges that a flat field may explain are named as either. Sides that other
-    views measure better do not count.
+    An edge shows an object if it is above what air reads there, the lower quartile of all edges of
+    its side if that is a small part of the greatest line integral, and above the noise of a group
+    of views. Flat edges that a flat field may explain, see `_flat_air`, are named as either. Sides
+    that other views measure better do not count.
     """
     edges = edges.flatten(0, 1)
     ends, nexts, shares, level, greatest, noise = edges.split(PARTS, dim=-2)
@@ -243,30 +241,35 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     seen = _grouped(used)
     ends, nexts = (divided(_grouped(x * used), seen, -math.inf) for x in (ends, nexts))
     most, top = (_grouped(x).amax(dim=(0, 3))[..., None] for x in (level, greatest))  # [k 1 1]
-    known, beside = (torch.where(seen > 0, x, torch.nan) for x in (ends, nexts))
-    sure, possible = _air(known, beside, top)
+    known = torch.where(seen > 0, ends, torch.nan).permute(1, 2, 0, 3).flatten(2)
+    lowest = known.nanquantile(AIR_QUANTILE, dim=2, keepdim=True).nan_to_num(0).clamp_min(0)
+    air = lowest * (lowest < CUT_EDGE * top)
     noise = _grouped(noise) / math.sqrt(_per_group(edges))
 
-    def cut_beyond(air: Float[Tensor, "k n 1"]) -> Bool[Tensor, "g k i"]:
-        return (ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise).any(dim=2)
+    def beyond(air: Float[Tensor, "k n 1"]) -> Bool[Tensor, "g k n i"]:
+        return ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise
 
-    cut, either = cut_beyond(possible), False
-    if not (cut.double().mean(dim=0) > WARNED_VIEWS).any():
-        cut, either = cut_beyond(sure), True
+    shown = beyond(air)
+    edge, beside = (torch.where(shown, x, torch.nan) for x in (ends, nexts))
+    flat = _flat_air(edge, beside, top)
+    cut = beyond(torch.maximum(air, flat)).any(dim=2)
+    either = not (cut.double().mean(dim=0) > WARNED_VIEWS).any()
+    if either:
+        cut = shown.any(dim=2)
     views = cut.double().mean(dim=0)
     worst = int(views.amax(dim=1).argmax())
     named = views[worst] > WARNED_VIEWS
     if not named.any():
         return
-    height = (ends.amax(dim=2) / most[:, 0])[:, worst][cut[:, worst]].mean().item()
+    height = ends.amax(dim=2)[:, worst][cut[:, worst]].mean().item()
     where, rows = f"{views[worst].max().item():.0%} of them", named.double().mean().item()
     where = where if rows == 1 else f"{where} and in {rows:.0%} of their rows"
-    off = 1 - math.exp(-possible[worst].max().item())
+    off = 1 - math.exp(-height)
     what = f"a wide, weak object, or their flat field is {off:.0%} off" if either else "the object"
     warnings.warn(
         f"Views end inside {what}: in {where} line integrals at a side of the detector are "
-        f"above noise and what air reads, in the mean {height:.0%} of the greatest ones, or of "
-        f"{MAX_LEVEL:g} times their mean. "
+        f"above noise and what air reads, in the mean {(height / most[worst]).item():.0%} of the "
+        f"greatest ones, or of {MAX_LEVEL:g} times their mean. "
         + (
             "Their rows are continued as those of ellipses: values inside the field of all views "
             "may be too high or too low by some per cent where the object is hollow or uneven at "
