@@ -122,8 +122,8 @@ def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
     edges = edges.flatten(0, 1)
     top = edges.split(PARTS, dim=-2)[3].amax(dim=(1, 2, 3))[:, None, None]
     ends, *_, noise = _grouped(edges).split(PARTS, dim=-2)
-    noise = noise / math.sqrt(_per_group(edges))
-    # that of sixteen pixels is half as much by chance somewhere
+    noise = noise / math.sqrt(edges.shape[1] // len(noise))  # the least number of views in a group
+    # an estimate from sixteen pixels is somewhere half the noise by chance
     noise = torch.maximum(noise, noise.movedim(1, 0).flatten(1).median(dim=1).values[:, None, None])
     lowest = ends.amin(dim=3, keepdim=True)
     air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
@@ -134,11 +134,6 @@ def _grouped(x: Float[Tensor, "k m n i"]) -> Float[Tensor, "g k n i"]:
     """Means over groups of consecutive views."""
     parts = x.tensor_split(min(VIEW_GROUPS, x.shape[1]), dim=1)
     return torch.stack([part.mean(dim=1) for part in parts])
-
-
-def _per_group(edges: Float[Tensor, "k m n i"]) -> int:
-    """The least number of views in a group."""
-    return edges.shape[1] // min(VIEW_GROUPS, edges.shape[1])
 
 
 def truncated(edges: Float[Tensor, "b c k 10 i"]) -> Bool[Tensor, "b c k 1 1"]:
@@ -244,7 +239,7 @@ def warn_of_truncation(edges: Float[Tensor, "b c m 10 i"], extrapolate: bool) ->
     known = torch.where(seen > 0, ends, torch.nan).permute(1, 2, 0, 3).flatten(2)
     lowest = known.nanquantile(AIR_QUANTILE, dim=2, keepdim=True).nan_to_num(0).clamp_min(0)
     air = lowest * (lowest < CUT_EDGE * top)
-    noise = _grouped(noise) / math.sqrt(_per_group(edges))
+    noise = _grouped(noise) / math.sqrt(edges.shape[1] // len(seen))
 
     def beyond(air: Float[Tensor, "k n 1"]) -> Bool[Tensor, "g k n i"]:
         return ends - air > CUT_EDGE * most + MIN_DEVIATIONS * noise
