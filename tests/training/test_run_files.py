@@ -43,6 +43,7 @@ def test_paths_mean_the_same_from_any_folder(tmp_path, monkeypatch):
     assert found["scene"] == {"name": "hdf5", "path": str(tmp_path / "a.h5")}
     assert found["test_scene"] == given["test_scene"]
     assert found["name"] == "path" and absolute_paths(found, TrainSettings) == found
+    (tmp_path / "dark.tif").touch()  # what is no file may be a name in the scan's
     found = absolute_paths(measured, ReconstructSettings)
     assert found["views"]["dark"] == str(tmp_path / "dark.tif") and found["views"]["flat"] == 5e4
     assert found["grid"]["like"] == str(tmp_path / "ct.nii.gz")
