@@ -14,19 +14,17 @@ import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.methods.method import build_method
 
+#: Of the networks of this study, without weights of single rays and reweighted iterations.
+EARLIER = {"name": "cross_view", "ray_widths": [], "weight_widths": [8], "reweight": 0}
 METHODS = {
     "world_unet": {"name": "world_unet"},
     "world_unet, 18 channels": {"name": "world_unet", "widths": (18, 36, 72)},
     "world_unet, 24 channels": {"name": "world_unet", "widths": (24, 48, 96)},
-    "cross_view": {"name": "cross_view"},
-    "cross_view, reweight=12": {"name": "cross_view", "reweight": 12},
-    "cross_view, fine frusta": {
-        "name": "cross_view",
-        "depth_widths": (16, 32),
-        "depths": 16,
-        "binning": 3,
-        "consistency": 2,
-    },
+    "cross_view": EARLIER,
+    "cross_view, reweight=12": EARLIER | {"reweight": 12},
+    "cross_view, fine frusta": EARLIER
+    | {"depth_widths": (16, 32), "depths": 16, "binning": 3, "consistency": 2},
+    "cross_view, default of today": {"name": "cross_view"},
 }
 BATCH, ROUNDS = 4, 12
 

@@ -338,7 +338,6 @@ def em_change(
     return volume * torch.where(crossed, geometry.column * geometry.A.T(ray_weights * ratio) - 1, 0)
 
 
-@torch.no_grad()
 def reweighted(
     geometry: Geometry,
     volume: Float[Tensor, "b 1 d h w"],
@@ -346,10 +345,10 @@ def reweighted(
     ray_weights: Float[Tensor, "b 1 m v u"] | float,
     iterations: int,
 ) -> Float[Tensor, "b 1 d h w"]:
-    """Continue SIRT with momentum with weighted rays, in the unit of the volume; not
-    differentiated.
+    """Continue SIRT with momentum with weighted rays, in the unit of the volume.
 
-    It minimises the weighted least squares of iterative reweighting, as `robust_sirt`.
+    It minimises the weighted least squares of iterative reweighting, as `robust_sirt`, and is
+    differentiated: weights whose gradients came from later steps alone lost ever more rays.
     """
     weights = geometry.weights
     if isinstance(ray_weights, Tensor):

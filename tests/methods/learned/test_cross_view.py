@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 from torch.nn.functional import avg_pool2d, avg_pool3d
 
 from mvrecon.core.parts import CAMERAS, PROJECTORS
@@ -356,6 +357,25 @@ def test_reweighted_sirt_leaves_out_a_camera_without_weight():
     torch.testing.assert_close(volume, expected)
     assert not torch.allclose(volume, sirt(A, views, 8, momentum=True, start=start), rtol=1e-2)
     assert torch.equal(reweighted(geometry, start, views, 0 * weights, 8), start)
+
+
+def test_reweighted_sirt_has_the_gradients_of_all_its_iterations():
+    """In weights and start, by finite differences in float64, where no voxel is clipped."""
+    A = small_projector()
+    generator = torch.Generator().manual_seed(0)
+    weights, direction = (
+        0.5 + torch.rand(1, 1, *A.range_shape, generator=generator, dtype=torch.float64)
+        for _ in range(2)
+    )
+    start = 1 + torch.rand(1, 1, *A.grid.shape, generator=generator, dtype=torch.float64)
+    views, geometry = A(start + 0.1), Geometry.of(A, torch.float64)
+
+    def error(move: Tensor) -> Tensor:
+        volume = reweighted(geometry, start + move, views, weights + move * direction, 4)
+        return volume.square().sum()
+
+    move = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(error, move, eps=1e-5, rtol=1e-6)
 
 
 @pytest.mark.parametrize("options", [{}, {"fusion": "mean"}, {"weigh_rays": False}], ids=str)
