@@ -22,13 +22,15 @@ from mvrecon.methods.classical.orbit import Orbit, fan_coordinate, orbit_of
 
 #: Greatest shift relative to the columns, and at least so many.
 REACH, MIN_REACH = 0.1, 4
-#: Steps in pixels of the parabola that is fitted at the best shift, the second one where the
-#: uncertainty by noise is below the third figure; fits, each at the last one's minimum.
+#: Steps in pixels of the shifts, and of the parabola that is fitted at the best one; the second
+#: where the uncertainty by noise is below the third figure; fits, each at the last one's minimum.
 STEP, FINE_STEP, FINE_ERROR, FITS = 0.5, 0.25, 0.05, 5
 #: Greatest deviation of a step between two views' angles, relative to it, and fewest views.
 MAX_STEP_DEVIATION, MIN_VIEWS = 0.02, 8
 #: Uncertainty in pixels without noise, in standard errors, and the largest of a shift found.
 LEAST_PX, STANDARD_ERRORS, MOST_PX = 0.02, 3.0, 0.1
+#: Rays about which the search compares, at even steps of views and columns; the fit takes all.
+SEARCHED = 2**17
 #: Groups of consecutive views whose spread is the standard error: neighbours err alike.
 GROUPS = 24
 
@@ -48,9 +50,11 @@ class _Lines(NamedTuple):
     orbit: Orbit
     step: float
 
-    def differences(self, shift: float) -> tuple[Float[Tensor, "m u"], Bool[Tensor, "m u"]]:
-        """Differences between the rays of a shifted panel and their conjugates, in the unit of the
-        views, and which rays have one.
+    def differences(
+        self, shift: float, every: int
+    ) -> tuple[Float[Tensor, "n k"], Bool[Tensor, "n k"]]:
+        """Differences between rays of a shifted panel, at so many views and columns each, and their
+        conjugates, in the unit of the views, and which rays have one.
 
         Conjugates are interpolated, which averages noise. Unless its standard deviation were
         divided out, panels with conjugates half-way between pixels would agree best.
@@ -59,11 +63,12 @@ class _Lines(NamedTuple):
         u = torch.arange(columns, dtype=torch.float64)
         fan = fan_coordinate(self.camera, self.orbit, u + shift, u.new_zeros(1))[0, 0]
         sign = 1 if fan[-1] > fan[0] else -1
-        right = torch.searchsorted(sign * fan, -sign * fan).clamp(1, columns - 1)
-        column = right - (fan[right] + fan) / (fan[right] - fan[right - 1])
-        angle = math.pi - (0 if self.camera.parallel else 2) * fan
+        rays = fan[::every]
+        right = torch.searchsorted(sign * fan, -sign * rays).clamp(1, columns - 1)
+        column = right - (fan[right] + rays) / (fan[right] - fan[right - 1])
+        angle = math.pi - (0 if self.camera.parallel else 2) * rays
         turn = abs(2 * math.pi / self.step)
-        view = torch.arange(views, dtype=torch.float64)[:, None] + angle / self.step
+        view = torch.arange(0, views, every).double()[:, None] + angle / self.step
         view = torch.remainder(view, turn)
         last = views if abs(turn - views) < 0.5 else views - 1  # the first view follows
         inside = (view <= last) & (column >= 0) & (column <= columns - 1)
@@ -74,29 +79,39 @@ class _Lines(NamedTuple):
             self.rows[k, j] * (1 - b) + self.rows[k, j + 1] * b for k in (i, (i + 1) % views)
         )
         variance = 1 + (a**2 + (1 - a) ** 2) * (b**2 + (1 - b) ** 2)
-        return (self.rows - before * (1 - a) - behind * a) / variance.sqrt(), inside
+        measured = self.rows[::every, ::every]
+        return (measured - before * (1 - a) - behind * a) / variance.sqrt(), inside
 
-    def misfit(self, shift: float) -> Float[Tensor, " m"]:
+    def misfits(self, shifts: Float[Tensor, " k"], every: int = 1) -> Float[Tensor, "k n"]:
         """What each view contributes to the mean square of the differences, without what a column
         has in all views: flat fields, rings and scatter are the panel's; infinite where fewer than
         `MIN_VIEWS` views have conjugate rays.
+
+        Only rays that have conjugates at all shifts count. Otherwise a greater shift loses rays of
+        air, which have little noise, and the rest would agree worse in the mean.
         """
-        difference, inside = self.differences(shift)
+        found = [self.differences(shift, every) for shift in shifts.tolist()]
+        inside = torch.stack([each for _, each in found]).all(dim=0)
         count, views = inside.sum(), inside.sum(dim=0)
         if views.max() < MIN_VIEWS:
-            return self.rows.new_full((len(self.rows),), torch.inf)
-        fixed = (difference * inside).sum(dim=0) / views.clamp_min(1)
-        return ((difference - fixed).square() * inside).sum(dim=1) / count
+            return self.rows.new_full((len(shifts), len(found[0][0])), torch.inf)
+        parts = []
+        for difference, _ in found:
+            fixed = (difference * inside).sum(dim=0) / views.clamp_min(1)
+            parts.append(((difference - fixed).square() * inside).sum(dim=1) / count)
+        return torch.stack(parts)
 
 
 @torch.no_grad()
 def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Grid) -> Axis:
     """Return the shift of all detectors along u by which conjugate rays agree best; 0 with infinite
     uncertainty for views that do not determine it: of parallel beams over half a turn, without
-    contrast, at unequal steps, or that differ from their conjugates by half of themselves.
+    contrast, at unequal steps, that differ from their conjugates by half of themselves, or of
+    periodic objects, which agree as well at another shift.
 
     The uncertainty is three standard errors, from the spread of the contributions of
-    groups of views, and at least 0.02 pixels.
+    groups of views, and at least 0.02 pixels. An object that moves, or a wrong arc, between views
+    half a turn apart looks like a shift: no conjugate ray tells them apart.
 
     Args:
         cameras: a rig on a circle, with rows across its axis.
@@ -107,15 +122,17 @@ def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Gr
     if lines is None:
         return KEPT
     reach = max(MIN_REACH, int(REACH * lines.rows.shape[1]))
-    sums = torch.stack([lines.misfit(s).sum() for s in range(-reach, reach + 1)])
-    best = float(sums.argmin()) - reach
+    shifts = torch.arange(-reach, reach + STEP, STEP, dtype=torch.float64)
+    every = math.ceil(math.sqrt(lines.rows.numel() / SEARCHED))
+    sums = torch.stack([lines.misfits(shift[None], every).sum() for shift in shifts])
+    best = shifts[sums.argmin()].item()
     if abs(best) == reach or not sums.isfinite().any():
         return KEPT
     step, five = STEP, torch.arange(-2.0, 3.0, dtype=torch.float64)
-    change = error = left = math.inf
+    change = error = least = curvature = math.inf
     for _ in range(FITS):
         places = step * five
-        misfits = torch.stack([lines.misfit(best + place) for place in places.tolist()])
+        misfits = lines.misfits(best + places)
         slopes = places @ misfits / places.square().sum()  # of each view
         bend = places.square() - places.square().mean()
         curvature = (2 * (bend @ misfits.sum(dim=1)) / bend.square().sum()).item()
@@ -126,8 +143,13 @@ def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Gr
         spread = torch.stack([part.sum() for part in slopes.tensor_split(GROUPS)]).norm().item()
         error = STANDARD_ERRORS * spread / curvature
         step = FINE_STEP if error < FINE_ERROR else STEP
-        left = (misfits[2].sum() / lines.rows.square().mean()).item()
-    if abs(best) > reach or abs(change) > STEP or error > MOST_PX or left > MAX_LEFT_OUT**2:
+        least = misfits[2].sum().item()
+    if abs(best) > reach or abs(change) > STEP or error > MOST_PX:
+        return KEPT
+    # what a minimum as deep as this one has at the nearest of the shifts
+    as_good = least + curvature * (STEP / 2) ** 2 / 2
+    periodic = sums[(shifts - best).abs() > 1].min() < as_good
+    if periodic or least > MAX_LEFT_OUT**2 * lines.rows.square().mean():
         return KEPT
     return Axis(best, max(LEAST_PX, error))
 

@@ -111,13 +111,13 @@ def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
 
 def _turn(cameras: Cameras, grid: Grid) -> Orbit:
     beams = unit(cameras.origin - cameras.source)
-    _, sizes, axes = torch.linalg.svd(beams)
+    _, sizes, axes = torch.linalg.svd(beams, full_matrices=False)
     if len(beams) < 2 or sizes[1] < 1e-6 * sizes[0]:
         raise ValueError(
             f"FBP needs parallel beams from two directions at least, got {len(beams)} views along "
             f"one line"
         )
-    axis = axes[2]
+    axis = torch.linalg.cross(axes[0], axes[1])
     if (leave := (beams @ axis).abs().max().item()) > MAX_ORBIT_DEVIATION:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "
@@ -144,7 +144,7 @@ def _circle(cameras: Cameras) -> Orbit:
     places = cameras.source - mean
     extent = places.norm(dim=1).max()
     places = places / extent if extent > 0 else places  # independent of the unit of length
-    _, sizes, axes = torch.linalg.svd(places)
+    _, sizes, axes = torch.linalg.svd(places, full_matrices=False)
     if count < 3 or sizes[1] < 1e-6 * sizes[0] or not sizes[0] > 0:
         raise ValueError(
             f"FDK needs at least three sources on a circle, got {count} on a line; use sirt"

@@ -18,6 +18,7 @@ from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, dcspect80, dome, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.rigid import euler_rotation
+from mvrecon.methods.classical.orbit import orbit_of
 from tests.geometry.cameras.rigs import OPTIONS
 
 PLATE = {"pixels": [64, 96], "pixel_mm": 4.0}
@@ -75,6 +76,17 @@ def test_the_field_of_a_half_fan_is_that_of_the_lines_it_measures():
         )
     whole = circular(180, 400.0, 800.0, PLATE)
     assert full_fan(whole) is whole
+
+
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_a_fine_scan_takes_no_square_of_its_views(beam):
+    """300 000 views: singular vectors of all views, 720 GB, were made and never used."""
+    panel = {"pixels": [2, 96], "pixel_mm": 4.0, "offset_mm": [0.0, 100.0]}
+    views = 300_000
+    rig = circular(views, 400.0, 800.0, panel) if beam == "cone" else parallel(views, panel)
+    assert (full_fan(rig).shape[1] > 96) is (beam == "cone")
+    orbit = orbit_of(rig, Grid.centred(4, spacing=1.0))
+    assert abs(abs(orbit.axis[2].item()) - 1) < 1e-9
 
 
 @pytest.mark.parametrize("arc", [200.0, 220.0, 300.0])

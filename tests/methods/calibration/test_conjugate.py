@@ -1,6 +1,7 @@
 """The axis of closed-form objects comes back from conjugate rays, also of truncated views."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -134,3 +135,47 @@ def test_views_over_another_arc_than_stated_tell_no_axis(beam, true, said):
     for seed in range(4):
         views = views_of(rig_of(beam, float(true)), object_of(seed, 40.0), 1.25)
         assert conjugate_axis(rig_of(beam, float(said)), views, GRID) == KEPT
+
+
+@pytest.mark.parametrize(("beam", "offset"), [("parallel", 5.2), ("parallel", 2.2), ("fan", 1.3)])
+def test_the_noise_of_bodies_in_air_does_not_draw_the_axis_inwards(beam, offset):
+    """Rays of air have the least noise, and a shift loses them at one side: the mean over 16 scans
+    was 0.04 to 0.07 pixels off. Also tried: 500 and 1000 photons, scatter, rings and drift.
+    """
+    rig, off = rig_of(beam, 360.0), []
+    turn, place = torch.eye(3, dtype=torch.float64), torch.tensor([[5.0, 0, 0]]).double()
+    size = torch.tensor([[35.0, 35.0, 400.0]]).double()
+    disc = Phantom((Solids("ellipsoid", place, turn[None], size, torch.tensor([1.2 / 35])),))
+    for seed in range(16):
+        axis = conjugate_axis(rig, views_of(rig, disc, offset, 200, seed), GRID)
+        if axis != KEPT:
+            off.append(axis.offset - offset)
+            assert abs(off[-1]) < 2 * axis.uncertainty
+    assert len(off) >= 12 and abs(sum(off) / len(off)) < 0.035
+
+
+@pytest.mark.parametrize("offset", [-2.3, 0.4, 5.0])
+@pytest.mark.parametrize(("beam", "views"), [("fan", 40), ("fan", 120), ("parallel", 40)])
+def test_rings_of_rods_have_no_axis_a_period_aside(beam, views, offset):
+    """Sixty equal rods, 3 pixels apart, agree nearly as well 1.5 pixels aside: the axis was 1.4
+    pixels off and certain to 0.02. Also tried: squares, rows, and single wires.
+    """
+    angle = torch.arange(60).double() * math.pi / 30
+    centres = 30 * torch.stack([angle.cos(), angle.sin(), 0 * angle], dim=1)
+    turn = torch.eye(3, dtype=torch.float64).expand(60, 3, 3)
+    radii = torch.tensor([1.0, 1.0, 99.0], dtype=torch.float64).expand(60, 3)
+    values = torch.full((60,), 0.2, dtype=torch.float64)
+    rods = Phantom((Solids("ellipsoid", centres, turn, radii, values),))
+    for arc in (215.0, 360.0):
+        rig = rig_of(beam, arc, views=views)
+        axis = conjugate_axis(rig, views_of(rig, rods, offset, 1e5), GRID)
+        assert axis == KEPT or abs(axis.offset - offset) < 2 * axis.uncertainty
+
+
+def test_the_axis_of_a_large_scan_comes_back():
+    """Of views that are searched at every second row and column."""
+    rig = rig_of("fan", 360.0, views=720, columns=480)
+    rig = replace(rig, u=rig.u / 5, origin=rig.origin + 191.6 * rig.u)
+    views = views_of(rig, object_of(3, 40.0), 17.4)
+    axis = conjugate_axis(rig, views, GRID)
+    assert abs(axis.offset - 17.4) < 2 * axis.uncertainty
