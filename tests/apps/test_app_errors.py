@@ -422,6 +422,7 @@ def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):
             "init_from=nowhere": "nowhere",
             "resume=nowhere": "resume",
             "trainer.strategy=fsdp": "strategy",
+            "trainer=bf16 device=cpu": "trainer.precision=bf16-mixed on a CPU",
         },
         "simulate": {"picture=x": "picture", "scene=volumes scene.path=nowhere": "nowhere"},
         "reconstruct": {"calibrate=[sped]": "/x", "views.path=nowhere": "nowhere"},
