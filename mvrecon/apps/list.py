@@ -171,7 +171,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not options.kind and not options.check:
         overview()
         return 0
-    parts = listed(options.kind)
+    from mvrecon.apps.config.errors import one_line  # imports Hydra
+
+    with one_line("mvrecon-list"):  # imports the parts
+        parts = listed(options.kind)
     if name := options.name:
         known = {part.name for part in parts}
         parts = [part for part in parts if part.name == name]

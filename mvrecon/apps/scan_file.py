@@ -168,7 +168,8 @@ def _word(file: Path, key: str, value: Any) -> str:
         return f"[{','.join(_word(file, key, inner) for inner in value)}]"
     if isinstance(value, Path):
         told = str(value).removeprefix(f"{file.parent.absolute()}/").removeprefix(f"{file.parent}/")
-        if "${" not in told and (value.exists() or NAMED.fullmatch(told)):
+        inside = told.isprintable() and file_in(file.parent, str(value)) is not None
+        if "${" not in told and (value.exists() or inside or NAMED.fullmatch(told)):
             return str(value.absolute())
     elif value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.apps.command_line import command_line
+from mvrecon.apps.config.errors import one_line
 from mvrecon.core.files.atomic import check_writable, written_whole
 from mvrecon.core.files.checks import from_home
 
@@ -89,10 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `mvrecon-view`."""
     options = parser().parse_args(arguments)
     window = None if options.window is None else (options.window[0], options.window[1])
-    try:
+    with one_line("mvrecon-view"):
         place = view(options.volume, options.cameras, options.out, window, options.first)
-    except (OSError, ValueError, ImportError) as error:
-        sys.exit(f"mvrecon-view: {error}")
     sys.stdout.write(f"{place}, {place.stat().st_size / 2**20:.1f} MiB: open it in a browser\n")
 
 

@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from mvrecon.apps.command_line import command_line
+from mvrecon.apps.config.errors import one_line
 
 #: Voxels along an edge, pixels along a detector's, and views: as few as every kernel works with.
 VOXELS, PIXELS, VIEWS = 8, 8, 4
@@ -76,10 +77,11 @@ def parser() -> argparse.ArgumentParser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of `mvrecon-warmup`."""
     parser().parse_args(arguments)
-    seconds = warm_up()
-    from mvrecon.kernels.compiling import kept_in
+    with one_line("mvrecon-warmup"):
+        seconds = warm_up()
+        from mvrecon.kernels.compiling import kept_in
 
-    sys.stdout.write(f"kernels are ready after {seconds:.0f} s, kept in {kept_in()}\n")
+        sys.stdout.write(f"kernels are ready after {seconds:.0f} s, kept in {kept_in()}\n")
     return 0
 
 

@@ -40,7 +40,8 @@ class CaseStore:
 
     Args:
         folder: created if missing.
-        made_of: settings of scene and projector and digests of their files: names, numbers, paths.
+        made_of: settings of scene and projector and digests of their files and code: names,
+            numbers, paths.
         scene: its `seed_of(index, seed)` gives the seed on which a case depends.
     """
 

@@ -5,6 +5,7 @@ import hashlib
 import json
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -67,6 +68,24 @@ def of_file(path: str | Path) -> str:
         whole = [_of_bytes(file) for file in (path, *stated)]
         return hashlib.sha256(json.dumps(whole).encode()).hexdigest()
     return _of_bytes(path)
+
+
+def of_code(*parts: Any) -> dict[str, str]:
+    """Digests of the Python files of the modules or packages that define parts, by name; a release
+    of mvrecon is told by its version, and a notebook has no file.
+    """
+    found = {}
+    modules = {part.__module__ for part in parts}
+    packages = {name.partition(".")[0] for name in modules}  # namespace packages have no file
+    for name in sorted(modules | packages):
+        if name.partition(".")[0] == "mvrecon":
+            continue
+        if place := getattr(sys.modules.get(name), "__file__", None):
+            path = Path(place)
+            files = sorted(path.parent.rglob("*.py")) if path.stem == "__init__" else [path]
+            whole = json.dumps([_of_bytes(file) for file in files])
+            found[name] = hashlib.sha256(whole.encode()).hexdigest()
+    return found
 
 
 def _of_bytes(path: Path) -> str:

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 
 from mvrecon import __version__
 from mvrecon.core.numbers import data_range_of
-from mvrecon.core.parts import CAMERAS, SCENES, ScenePart
+from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES, ScenePart
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import from_options
 from mvrecon.data import dataset, digests as sha256
@@ -279,8 +279,12 @@ class SceneData(L.LightningDataModule):
         scene, store = self.scenes[key], None
         if self.loading.cache is not None:
             digests = self.digests(key)
+            parts: list[Any] = [type(scene)]
+            if self.projector is not None:
+                parts.append(PROJECTORS.get(self.projector["name"]))
             made_of = {
                 "version": __version__,
+                "code": sha256.of_code(*parts),
                 "scene": self._settings[key],
                 "files": {path: digests[path] for path in self._files[key]},
                 "projector": self.projector,

@@ -126,7 +126,8 @@ def _number(value: float | str | None) -> float:
 
 def _names(folders: Sequence[Path]) -> list[str]:
     """Name each run by its sweep's overrides, without ++; else by its differing settings, or its
-    folder without any. If a value is too long for a name, the setting's values are numbered.
+    folder without any; the path of the folder tells equal names apart. If a value is too long for a
+    name, the setting's values are numbered.
     """
     of_sweep = [folder.name for folder in folders]
     if len(set(of_sweep)) == len(folders) > 1 and all("=" in name for name in of_sweep):
@@ -146,7 +147,11 @@ def _names(folders: Sequence[Path]) -> list[str]:
         for name, s, text in zip(named, settings, texts, strict=True):
             if key in s:
                 name.append(f"{key.removesuffix('.name')}={text}")
-    return [", ".join(name) or folder.name for name, folder in zip(named, folders, strict=True)]
+    names = [", ".join(name) or folder.name for name, folder in zip(named, folders, strict=True)]
+    return [
+        name if names.count(name) == 1 else f"{name} ({folder})"
+        for name, folder in zip(names, folders, strict=True)
+    ]
 
 
 def _settings(folder: Path) -> dict[str, Any]:

@@ -48,6 +48,9 @@ from mvrecon.training.trained import begin_from, check_trained
 
 #: Lightning's distributed strategies that keep a single checkpoint file.
 STRATEGIES = ("auto", "ddp", "ddp_find_unused_parameters_true")
+#: Precisions on a CPU. In bfloat16, oneDNN's derivatives in the weights of convolutions other than
+#: those of `unet`, as of 3x3 pixels with strides of 2, read memory that nothing has written.
+FULL_PRECISIONS = ("32-true", "64-true")
 #: Seconds for the first process to end after another one has died.
 GRACE_SECONDS = 60.0
 #: Seconds after which a dead process has been reaped.
@@ -267,6 +270,7 @@ def build_trainer(settings: TrainSettings, folder: Path, method: str) -> L.Train
 
     Raises:
         PermissionError: a callback or a logger that would write outside that folder.
+        ValueError: half precision on a CPU.
     """
     logs, last = logs_of(settings, folder, method), checkpoints.unfinished(folder, method)
     hooks: list[Any] = [
@@ -301,6 +305,12 @@ def build_trainer(settings: TrainSettings, folder: Path, method: str) -> L.Train
     options |= {"callbacks": hooks, "logger": loggers, "plugins": plugins}
     options |= {"default_root_dir": logs, "use_distributed_sampler": False}
     trainer = L.Trainer(**options)
+    if trainer.strategy.root_device.type == "cpu" and trainer.precision not in FULL_PRECISIONS:
+        raise ValueError(
+            f"Got trainer.precision={trainer.precision} on a CPU, where the gradients of some "
+            f"convolutions in half precision are arbitrary; expected one of {FULL_PRECISIONS}, or "
+            f"a GPU. method.precision=auto uses bfloat16 where it is right"
+        )
     trainer.fit_loop.epoch_loop = WholeSteps(trainer, trainer.min_steps, trainer.max_steps)
     return trainer
 

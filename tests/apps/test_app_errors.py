@@ -404,6 +404,28 @@ def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path
             assert re.search(rf"FileNotFoundError: .*{re.escape(str(tmp_path))}/scan\b", text), text
 
 
+@pytest.mark.parametrize(
+    ("app", "work", "line"),
+    [
+        ("compare", "compare", ["run"]),
+        ("list", "listed", ["--check"]),
+        ("view", "view", ["a.nii.gz"]),
+        ("warmup", "warm_up", []),
+    ],
+)
+def test_ctrl_c_ends_an_app_in_one_line(app: str, work: str, line, monkeypatch, capsys):
+    """Of the apps without Hydra, as of the others; also tried: SIGINT after 1 to 4 s of each."""
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    module = import_module(f"mvrecon.apps.{app}")
+    monkeypatch.setattr(module, work, stop)
+    with pytest.raises(SystemExit, match="130"):
+        module.main(line)
+    assert capsys.readouterr().err == f"mvrecon-{app}: stopped by Ctrl-C\n"
+
+
 def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):
     """Values that only a task refuses, of every app: labels that are paths, too long, empty but for
     dots, taken or unprintable; pictures, units, missing files. A folder of the user's stays.
@@ -422,6 +444,7 @@ def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):
             "init_from=nowhere": "nowhere",
             "resume=nowhere": "resume",
             "trainer.strategy=fsdp": "strategy",
+            "trainer=bf16 device=cpu": "trainer.precision=bf16-mixed on a CPU",
         },
         "simulate": {"picture=x": "picture", "scene=volumes scene.path=nowhere": "nowhere"},
         "reconstruct": {"calibrate=[sped]": "/x", "views.path=nowhere": "nowhere"},

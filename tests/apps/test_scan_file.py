@@ -7,6 +7,7 @@ import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mvrecon.apps.config import absolute_paths
+from mvrecon.apps.config.grammar import CommandLine
 from mvrecon.apps.scan_file import NAME, expanded, save
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
@@ -224,3 +225,23 @@ def test_an_exposure_by_name_is_no_path(folder: Path, monkeypatch, word: str):
         assert settings["views"]["exposure"] == typed
         save(folder / "else" / NAME, {"views": {"exposure": given}})
         assert expanded([f"scan={folder}/else"]) == [f"views.exposure={told}"]
+
+
+@pytest.mark.parametrize("name", ["a(1).h5", "a,b.h5", "it's.h5", "x{1}=#.h5", 'ä "[0] b.h5'])
+def test_data_sets_are_in_files_of_any_name(folder: Path, monkeypatch, name: str):
+    """As `save` writes them, and as typed: of angles, fields, exposures; also tried: $, ~ and
+    blanks, in folders of such names, and names of data sets with brackets.
+    """
+    monkeypatch.chdir(folder)
+    (folder / name).touch()
+    for key in ("angles", "flat", "exposure"):
+        for inside in ("/entry/x", "entry/x (1)"):
+            save(folder / "else" / NAME, {"views": {key: f"{name}:{inside}"}})
+            (told,) = CommandLine.of(expanded([f"scan={folder}/else"])).overrides
+            (typed,) = CommandLine.of([f"views.{key}={name}:{inside}"]).overrides
+            read = [OverridesParser.create().parse_override(line).value() for line in (told, typed)]
+            assert read == [f"{folder}/else/../{name}:{inside}", f"{name}:{inside}"]
+    told = {"views": {"angles": f"../{name}:/a\x1b[2J"}}
+    (folder / "else" / NAME).write_text(yaml.safe_dump(told))
+    with pytest.raises(Refused, match="a file as views.angles"):
+        expanded([f"scan={folder}/else"])

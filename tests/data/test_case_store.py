@@ -1,5 +1,7 @@
 """Cases stored in a folder: generated once for any detector, and never wrong."""
 
+import importlib
+import sys
 from dataclasses import replace
 
 import pytest
@@ -173,3 +175,43 @@ def test_cases_of_values_beside_their_header_are_regenerated_when_these_change(t
         return data.sets["test"].prepare()["volume"].max().item()
 
     assert truth(1000.0) > 1.5 * truth(0.0)
+
+
+@pytest.mark.parametrize("package", [False, True])
+def test_an_edited_scene_of_a_plugin_is_computed_anew(package, tmp_path, monkeypatch):
+    """A module of its own, or another file of its package than the one of the scene."""
+    name = f"edited_{package}"
+    home = tmp_path / name if package else tmp_path
+    home.mkdir(exist_ok=True)
+    value = home / "value.py" if package else tmp_path / f"{name}.py"
+    scene = (
+        "from mvrecon.core.parts import SCENES\n"
+        "from mvrecon.data.scenes.sample import Scene\n"
+        "class Mine(Scene):\n"
+        "    data_range, unit = 0.02, '1/mm'\n"
+        "    def sample(self, *case):\n"
+        "        return SCENES.build('ellipsoids', value=VALUE).sample(*case)\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+
+    def truth(number):
+        value.write_text(f"VALUE = {number}\n" + ("" if package else scene))
+        if package:
+            (home / "__init__.py").write_text(f"from {name}.value import VALUE\n" + scene)
+        for module in [key for key in sys.modules if key.partition(".")[0] == name]:
+            del sys.modules[module]
+        importlib.invalidate_caches()
+        monkeypatch.setitem(SCENES._parts, name, importlib.import_module(name).Mine)
+        data = SceneData(
+            dict.fromkeys(("train", "test"), {"name": name}),
+            {"grid": {"shape": [8, 8, 8], "spacing": 6.0}, "camera": RIG},
+            {"train": 1, "val": 1, "test": 1},
+            cache=str(tmp_path / "cases"),
+        )
+        data.setup("test")
+        return data.sets["test"].prepare()["volume"].max().item()
+
+    first = truth(0.01)
+    assert truth(0.02) == pytest.approx(2 * first) and truth(0.01) == first
+    assert len(list((tmp_path / "cases").iterdir())) == 2

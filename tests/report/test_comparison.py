@@ -88,6 +88,19 @@ def test_runs_of_a_sweep_have_its_names_and_numbers_for_long_values(tmp_path):
     assert names == set(texts)
 
 
+def test_runs_that_would_have_one_name_are_told_apart_by_their_folders(tmp_path):
+    """Repeated runs in several folders, and runs that differ in more settings than a name holds."""
+    for site in "ab":
+        run(tmp_path / site / "run", {"name": "x", "seed": 0}, sirt=(EASY, 1.0))
+    names = [row.run for row in read([tmp_path])]
+    assert names == [f"run ({tmp_path / site / 'run'})" for site in "ab"]
+    for seed in (1, 2):
+        options = dict.fromkeys("pqrs", 1) | {"seed": seed}
+        run(tmp_path / f"c{seed}", {"name": "x", **options}, sirt=(EASY, 1.0))
+    names = [row.run for row in read([tmp_path])]
+    assert len(set(names)) == 4, names
+
+
 def test_every_format_of_the_table_contains_every_method(sweep, tmp_path):
     out = tmp_path / "table"
     compare.compare([sweep], reference="unet", out=out)

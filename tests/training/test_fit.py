@@ -208,6 +208,19 @@ def test_the_progress_line_has_the_label_of_the_table(settings, tmp_path):
         assert isinstance(line, StepProgress) and line.label == label
 
 
+@pytest.mark.parametrize("precision", ["bf16-mixed", "bf16", "16-mixed", "bf16-true", "16-true"])
+def test_half_precision_on_a_cpu_is_refused(precision, settings, tmp_path):
+    """oneDNN's gradients of a convolution of 3x3 pixels with strides of 2, of any size, of 3x3x3
+    voxels in two slices, and of 4x4x4 with strides were found to be arbitrary in bfloat16.
+    """
+    label, trainer = settings.method["name"], {**settings.trainer, "accelerator": "cpu"}
+    with pytest.raises(ValueError, match="on a CPU, .*arbitrary; expected one of .*32-true"):
+        options = trainer | {"precision": precision}
+        fit.build_trainer(replace(settings, trainer=options), tmp_path, label)
+    for full in ("32-true", 32, "64-true"):
+        fit.build_trainer(replace(settings, trainer=trainer | {"precision": full}), tmp_path, label)
+
+
 def test_a_run_shorter_than_the_interval_of_validations_has_one(settings, tmp_path):
     label, trainer = settings.method["name"], {**settings.trainer, "val_check_interval": 100}
     for steps, batches, interval in ((60, 1, 60), (60, 3, 100), (200, 1, 100)):

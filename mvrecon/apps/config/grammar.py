@@ -19,6 +19,7 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString, Valu
 from hydra.errors import HydraException
 
 from mvrecon.apps.settings import SECTIONS
+from mvrecon.core.files.checks import file_in
 from mvrecon.core.machine import world
 from mvrecon.core.parts import LISTED
 from mvrecon.core.signatures import alternatives, describe, describe_section
@@ -154,7 +155,8 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
 
     Args:
         key: name of the setting.
-        value: the value as typed; an existing path is one text, whatever is in its name.
+        value: the value as typed; the path of an existing file, or of a data set in one, is one
+            text, whatever is in its name.
         names: settings of the app that are texts, also where a number is typed.
         sweeps: whether commas separate the values of a sweep.
     """
@@ -213,8 +215,9 @@ def _parts(text: str) -> tuple[list[str], bool]:
 
 
 def _exists(value: str) -> bool:
+    """Whether a value is the path of a file or folder, or of a data set in a file."""
     try:
-        return Path(value).expanduser().exists()
+        return file_in(Path.cwd(), value) is not None
     except (OSError, ValueError, RuntimeError):  # too long for a path; no such user
         return False
 
