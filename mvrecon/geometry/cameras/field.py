@@ -194,9 +194,8 @@ def full_fan(cameras: Cameras) -> Cameras:
         return cameras
     one_sided = (left < right).all() or (left > right).all()
     ways = unit(rig.origin - rig.source if rig.parallel else centre - rig.source)
-    axes = torch.linalg.svd(
-        ways, full_matrices=False
-    ).Vh  # of a circle, the last one is the axis of rotation
+    # of a circle, the last one is the axis of rotation
+    axes = torch.linalg.svd(ways, full_matrices=False).Vh
     angles = torch.atan2(ways @ axes[1], ways @ axes[0]).sort().values
     gaps = torch.cat([angles, angles[:1] + 2 * math.pi]).diff()
     directions, last = 0, -math.inf

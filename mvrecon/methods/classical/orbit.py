@@ -111,13 +111,13 @@ def orbit_of(cameras: Cameras, grid: Grid) -> Orbit:
 
 def _turn(cameras: Cameras, grid: Grid) -> Orbit:
     beams = unit(cameras.origin - cameras.source)
-    _, sizes, axes = torch.linalg.svd(beams, full_matrices=False)
+    _, sizes, axes = torch.linalg.svd(beams, full_matrices=len(beams) < 3)
     if len(beams) < 2 or sizes[1] < 1e-6 * sizes[0]:
         raise ValueError(
             f"FBP needs parallel beams from two directions at least, got {len(beams)} views along "
             f"one line"
         )
-    axis = torch.linalg.cross(axes[0], axes[1])
+    axis = axes[2]
     if (leave := (beams @ axis).abs().max().item()) > MAX_ORBIT_DEVIATION:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "
