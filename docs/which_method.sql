@@ -2,6 +2,7 @@ with rows as (
   select 'clean' as views, method, seed, [case], psnr from [experiments/29_ray_weights/networks.csv] where faults = 'none'
   union all select 'clean', method, seed, [case], psnr from [experiments/21_faults/clean_trained.csv] where method = 'world_unet'
   union all select 'clean', method, seed, [case], psnr from [experiments/29_ray_weights/classical.csv] where faults = 'none' and method != 'robust_48'
+  union all select iif(faults = 'none', 'clean', 'corrupted pixels'), method, seed, [case], psnr from [experiments/29_ray_weights/fista_tv.csv]
   union all select 'misaligned', method, seed, [case], psnr from [experiments/21_faults/unaligned.csv] where steps < 1500 and method in ('sirt', 'fista_tv', 'world_unet')
   union all select 'misaligned', method, seed, [case], psnr from [experiments/29_ray_weights/networks.csv] where faults like '%tilt%' and method = 'cross_view'
   union all select 'misaligned, then aligned', method, seed, [case], psnr from [experiments/21_faults/rig_errors_aligned.csv] where method != 'sirt_measured'
