@@ -110,7 +110,7 @@ def corrected_scan(
             f"saturated ones; crop them by views.rows and views.columns"
         )
     views = whole.views[None, None].to(device)
-    box = _holding(scan, views)
+    box = _grid_about(scan, views)
     grid = scan.grid if box is scan.grid else coarse(box, MAX_GRID_VOXELS)
     corrected, by = align(replace(scan, grid=grid).operator().to(device), views)
     by = by.to("cpu")
@@ -143,7 +143,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     pixels = _filled(whole, 1, scan.counts)
     axis = conjugate_axis(scan.cameras, pixels, scan.grid) if "offset_u" in free else KEPT
     about = replace(scan, cameras=scan.cameras.shifted(torch.tensor([[axis.offset, 0.0]])))
-    cut, box = cut_sides(pixels), _holding(about, pixels.to(device))
+    cut, box = cut_sides(pixels), _grid_about(about, pixels.to(device))
 
     def operator_of(grid, cameras):
         return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
@@ -279,7 +279,7 @@ def calibration_table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]
     }
 
 
-def _holding(scan: Scan, pixels: Float[Tensor, "1 1 m v u"]) -> Grid:
+def _grid_about(scan: Scan, pixels: Float[Tensor, "1 1 m v u"]) -> Grid:
     """The scan's grid, or the field of half of its views where the object extends beyond it."""
     A = PROJECTORS.from_config(
         scan.projector, grid=coarse(scan.grid, MAX_GRID_VOXELS), cameras=scan.cameras

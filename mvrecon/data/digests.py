@@ -72,7 +72,7 @@ def of_file(path: str | Path) -> str:
 
 def of_code(*parts: Any) -> dict[str, str]:
     """Digests of the Python files of the modules or packages that define parts, by name; a release
-    of mvrecon is told by its version, and a notebook has no file.
+    of mvrecon is identified by its version, and a notebook has no file.
     """
     found = {}
     modules = {part.__module__ for part in parts}

@@ -9,23 +9,27 @@ from typing import Any
 
 import h5py
 import numpy as np
+import tifffile
 import torch
 import yaml
 
+from mvrecon.apps import scan_file
 from mvrecon.core.files.checks import yaml_of
 from mvrecon.core.parts import CAMERAS
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.volume_files import read_volume, save_volume
 from mvrecon.geometry.cameras.files import from_file, save
-from mvrecon.geometry.cameras.formats import nikon
+from mvrecon.geometry.cameras.formats import nikon, rtk_xml
+from mvrecon.geometry.cameras.formats.common import angles_in
 from mvrecon.geometry.grid import Grid
 from mvrecon.training.module import ReconstructionModule
 from mvrecon.training.trained import load_checkpoint as load
 from mvrecon_baselines.pytorch3dunet import Example, read_example, write_example
 from tests.data.projections.conftest import dicom_image
-from tests.data.projections.test_nexus import tomo
+from tests.data.projections.test_nexus import exchange, tomo
 from tests.data.projections.test_nikon import xtekct
+from tests.data.test_vgi import vgi
 from tests.faults.hostile import pickle_of, saved, with_pickle
 
 Wrap = Callable[[bytes], bytes]
@@ -80,6 +84,11 @@ def read_views(path: Path) -> torch.Tensor:
     return stack.read(0, stack.n_views)
 
 
+def read_description(path: Path) -> list[str]:
+    """The command line of a scan.yaml."""
+    return scan_file.expanded([f"scan={path}"])
+
+
 def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, str]]:
     """By reader: how it reads, what is damaged, what is put around the damaged bytes, and the
     file's ending.
@@ -94,6 +103,9 @@ def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap,
     save(CAMERAS.from_config(RIG), folder / "a.json")
     hdf5, rig = ((folder / f"a.{suffix}").read_bytes() for suffix in ("h5", "json"))
     archive, whole = saved(checkpoint()), bytes
+    rtk_xml.write(CAMERAS.from_config(RIG), folder / "a.xml")
+    angles = "".join(f"{3.5 * k}\n" for k in range(40)).encode()
+    scan = yaml.safe_dump({"views": {"path": "v.tif", "flat": 5e4}, "camera": RIG}).encode()
     settings = yaml.safe_dump({"name": "train", "plugins": [], **METHOD["geometry"]}).encode()
     return {
         "HDF5 volumes": (read_volumes, hdf5, whole, ".h5"),
@@ -102,6 +114,15 @@ def samples(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap,
         **_views(folder),
         "cameras": (from_file, rig, whole, ".json"),
         "Nikon's geometry": (nikon.read, xtekct(folder).read_bytes(), whole, ".xtekct"),
+        "RTK's geometry": (
+            partial(rtk_xml.read, detector=RIG["detector"]),
+            (folder / "a.xml").read_bytes(),
+            whole,
+            ".xml",
+        ),
+        "angles": (angles_in, angles, whole, ".txt"),
+        "scan.yaml": (read_description, scan, whole, ".yaml"),
+        "VGStudio": (read_volume, vgi(folder).read_bytes(), whole, ".vgi"),
         "settings": (yaml_of, settings, whole, ".yaml"),
         "checkpoint": (load, archive, whole, ".ckpt"),
         "checkpoint's pickle": (load, pickle_of(archive), partial(with_pickle, archive), ".ckpt"),
@@ -121,7 +142,11 @@ def _views(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, 
     with h5py.File(folder / "v.h5", "w") as file:
         file.create_dataset("views", data=HU.astype("f4"), compression="gzip", shuffle=True)
     tomo(folder / "v.nxs")
+    exchange(folder / "x.h5")
+    tifffile.imwrite(folder / "v.ome.tif", HU.astype("u2"), metadata={"axes": "TYX"})
     return {
+        "views, Data Exchange": (read_views, (folder / "x.h5").read_bytes(), bytes, ".h5"),
+        "views, OME-TIFF": (read_views, (folder / "v.ome.tif").read_bytes(), bytes, ".ome.tif"),
         "pytorch-3dunet": (read_example, (folder / "e.h5").read_bytes(), bytes, ".h5"),
         **{
             f"views, {name}": (

@@ -21,7 +21,8 @@ READERS = [
     *("HDF5 volumes", "NIfTI", "NIfTI, then packed", "NIfTI, packed", "cameras", "settings"),
     *("checkpoint", "checkpoint's pickle"),
     *("MHA", "NRRD", "pytorch-3dunet", "views, TIFF", "views, PNG", "views, NumPy", "views, HDF5"),
-    *("views, DICOM", "views, NeXus", "Nikon's geometry"),
+    *("views, DICOM", "views, NeXus", "views, Data Exchange", "views, OME-TIFF"),
+    *("Nikon's geometry", "RTK's geometry", "angles", "scan.yaml", "VGStudio"),
 ]
 
 

@@ -122,6 +122,11 @@ def tiff_header(file: Path) -> Header:
                     f"{page.index}"
                 )
             numbers.append(page.tags.valueof("PageNumber"))
+        if len(stated) != len(pages):  # iteration ends where a page is not readable
+            raise Refused(
+                f"{file}: expected {len(pages)} pages, one after the other, got {len(stated)}; is "
+                f"it cut short or damaged?"
+            )
         text = _description(file, descriptions.without_own_id(pages[0].description))
         places = descriptions.places_in_set(text)
         _check_order(file, text, numbers, images, places)

@@ -39,7 +39,7 @@ class _Lines(NamedTuple):
     """The row of each view that is in the plane of the sources, turned by equal steps in radians.
 
     Args:
-        rows: its integrals, of the views in their order.
+        rows: line integrals of these rows.
         camera: the first camera.
         orbit: the sources' orbit.
         step: angle between two views.
@@ -83,9 +83,9 @@ class _Lines(NamedTuple):
         return (measured - before * (1 - a) - behind * a) / variance.sqrt(), inside
 
     def misfits(self, shifts: Float[Tensor, " k"], every: int = 1) -> Float[Tensor, "k n"]:
-        """What each view contributes to the mean square of the differences, without what a column
-        has in all views: flat fields, rings and scatter are the panel's; infinite where fewer than
-        `MIN_VIEWS` views have conjugate rays.
+        """The contribution of each view to the mean square of the differences, from which the mean
+        of each column over the views is subtracted: it is due to flat field, rings and scatter.
+        Infinite where fewer than `MIN_VIEWS` views have conjugate rays.
 
         Only rays that have conjugates at all shifts count. Otherwise a greater shift loses rays of
         air, which have little noise, and the rest would agree worse in the mean.
