@@ -1,20 +1,20 @@
-"""Trains small networks on inconsistent views at 16^3 voxels, each step on four new cases:
+"""Trains small networks at 16^3 voxels, each step on four cases, which repeat after 4000:
 
-    python experiments/29_ray_weights/small.py data STEPS SEEDS small.csv [ARM...]
+    python experiments/29_ray_weights/small.py data arms.yaml small.csv --steps 800 --seeds 3
 
-Each ARM of `ARMS`, all by default, is trained for STEPS with the seeds 0 to SEEDS - 1, of its
-weights and of the order of the cases. `data` has openkbp_train.h5 and openkbp_val.h5. The CSV file
-gets a row for each of 33 patients; what it has already is skipped.
+The YAML file has the options of a method for each name. `data` has openkbp_train.h5 and
+openkbp_val.h5. The CSV file gets a row for each test patient; what it has already is skipped.
 """
 
+import argparse
 import csv
-import sys
 import time
-from itertools import product
+from collections.abc import Iterable, Iterator
+from itertools import count, islice, product
 from pathlib import Path
-from typing import Any
 
 import torch
+from omegaconf import OmegaConf
 from torch import Tensor
 
 import mvrecon as mv
@@ -24,54 +24,54 @@ from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.methods.method import build_method
 
 FAULTS = {"views": 3, "rod": 0.25, "scatter": 0.15, "dead": 0.08, "probability": 0.5}
-BATCH, RATE, RANGE = 4, 2e-3, 0.04
+BATCH, RANGE = 4, 0.04
+PATIENTS, HELD_OUT = 170, range(150, 170)
 GRID = mv.Grid.centred(size=(16, 16, 16), spacing=(32.0, 20.0, 24.0))
 DETECTOR = {"pixels": [24, 24], "pixel_mm": [36.0, 40.0]}
 RIG = CAMERAS.build(
     "circular", n_views=8, arc_degrees=180.0, sid=1000.0, sdd=1500.0, detector=DETECTOR
 )
-SHARED: dict[str, Any] = {"widths": [8, 16, 32], "precision": "float32"}
-OURS, PLAIN = {"name": "cross_view", "scale": 1, **SHARED}, {"name": "world_unet", **SHARED}
-ROBUST = {"name": "robust_sirt", "iterations": 48}
-ARMS = {
-    "cross_view": OURS,
-    "cross_view, ray_widths=[]": OURS | {"ray_widths": []},
-    "cross_view, fusion=mean": OURS | {"fusion": "mean"},
-    "cross_view from robust_sirt": OURS | {"start": ROBUST},
-    "world_unet": PLAIN,
-    "world_unet from robust_sirt": PLAIN | {"start": ROBUST},
-    "robust_sirt": {"name": "robust_sirt"},
-    "sirt": {"name": "sirt", "iterations": 25, "momentum": True},
-}
+HEADER = ("method", "seed", "steps", "rate", "case", "psnr", "psnr_inside", "seconds")
 
 
-def cases(path: Path, count: int, seed: int, vary: bool) -> tuple[Tensor, Tensor, Tensor]:
-    """Views, volumes and masks of the body."""
+def cases(
+    path: Path, indices: Iterable[int], seed: int, vary: bool, faults: object
+) -> tuple[Tensor, ...]:
+    """Views, volumes and masks of the body. With `vary`, indices beyond the patients vary them."""
     scene = SCENES.build("hdf5", path=str(path), orientation="LPI", fine=2, rays=2, vary=vary)
-    acquisition = Acquisition.of({"photons": float("inf"), "disturbed": FAULTS})
+    acquisition = Acquisition.of({"photons": float("inf"), "disturbed": faults})
     acquired = Acquired(scene, {"name": "drr"}, acquisition)
-    samples = [acquired.sample(i, seed, GRID, RIG) for i in range(count)]
+    samples = [acquired.sample(i, seed, GRID, RIG) for i in indices]
     parts = ([getattr(one, name) for one in samples] for name in ("views", "volume", "inside"))
-    views, volumes, inside = map(torch.stack, parts)
-    return views, volumes, inside
+    return tuple(map(torch.stack, parts))
 
 
 def train(
-    method: torch.nn.Module, A: mv.LinearOperator, views: Tensor, volumes: Tensor, seed: int
+    method: torch.nn.Module,
+    A: mv.LinearOperator,
+    views: Tensor,
+    volumes: Tensor,
+    seed: int,
+    steps: int,
+    rate: float,
 ) -> None:
-    """Train by AdamW with a cosine, on the squared error of the volume, once on each case."""
-    adam = torch.optim.AdamW(method.parameters(), RATE, (0.9, 0.98), weight_decay=1e-4)
-    rate = torch.optim.lr_scheduler.OneCycleLR(
-        adam, RATE, total_steps=len(views) // BATCH, pct_start=0.05
-    )
-    order = torch.randperm(len(views), generator=torch.Generator().manual_seed(seed))
-    for batch in order.split(BATCH):
+    """Train by AdamW with a cosine, on the squared error of the volume."""
+    adam = torch.optim.AdamW(method.parameters(), rate, (0.9, 0.98), weight_decay=1e-4)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(adam, rate, total_steps=steps, pct_start=0.05)
+    for batch in islice(batches(len(views), seed), steps):
         error = (method(views[batch], A).volume - volumes[batch]) / RANGE
         adam.zero_grad()
         error.square().mean().backward()
         torch.nn.utils.clip_grad_norm_(method.parameters(), 1.0)
         adam.step()
-        rate.step()
+        schedule.step()
+
+
+def batches(cases: int, seed: int) -> Iterator[Tensor]:
+    """Indices of all cases in one random order after the other."""
+    generator = torch.Generator().manual_seed(seed)
+    while True:
+        yield from torch.randperm(cases, generator=generator).split(BATCH)
 
 
 def errors(
@@ -86,29 +86,60 @@ def errors(
     return list(zip(whole.tolist(), body.tolist(), strict=True))
 
 
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("data", type=Path, help="folder of the two files")
+    parser.add_argument("arms", type=Path, help="YAML file of methods")
+    parser.add_argument("out", type=Path, help="CSV file")
+    parser.add_argument("--only", nargs="*", default=[], help="names of methods (all)")
+    parser.add_argument("--steps", type=int, default=800, help="steps of a training (800)")
+    parser.add_argument("--seeds", type=int, default=1, help="trainings of each method (1)")
+    parser.add_argument("--rates", type=float, nargs="*", default=[2e-3], help="learning rates")
+    parser.add_argument("--clean", action="store_true", help="views without faults")
+    parser.add_argument(
+        "--validate", action="store_true", help="test on 20 patients that training leaves out"
+    )
+    return parser.parse_args()
+
+
 def main() -> None:
     """Train, test, add to the file."""
-    data, steps, seeds, out = (Path(sys.argv[1]), *map(int, sys.argv[2:4]), Path(sys.argv[4]))
+    given = arguments()
     torch.set_num_threads(1)
-    views, volumes, _ = cases(data / "openkbp_train.h5", BATCH * steps, 0, vary=True)
-    tests, A = cases(data / "openkbp_val.h5", 33, 1, vary=False), mv.Drr(GRID, RIG)
-    with out.open("a+", newline="") as file:
+    faults, A = None if given.clean else FAULTS, mv.Drr(GRID, RIG)
+    train_file, test_file = (given.data / f"openkbp_{name}.h5" for name in ("train", "val"))
+    left_out = HELD_OUT if given.validate else ()
+    indices = (i for i in count() if i % PATIENTS not in left_out)
+    views, volumes, _ = cases(
+        train_file, islice(indices, min(BATCH * given.steps, 4000)), 0, True, faults
+    )
+    tests = (
+        cases(train_file, HELD_OUT, 1, False, faults)
+        if given.validate
+        else cases(test_file, range(33), 1, False, faults)
+    )
+    arms = OmegaConf.to_container(OmegaConf.load(given.arms))
+    with given.out.open("a+", newline="") as file:
         file.seek(0)
-        known = {tuple(row[:3]) for row in csv.reader(file)}
-        writer = csv.writer(file)
+        known = {tuple(row[:4]) for row in csv.reader(file)}
+        writer = csv.writer(file, lineterminator="\n")
         if not known:
-            writer.writerow(("method", "seed", "steps", "case", "psnr", "psnr_inside", "seconds"))
-        for seed, arm in product(range(seeds), sys.argv[5:] or ARMS):
+            writer.writerow(HEADER)
+        for seed, arm, rate in product(range(given.seeds), given.only or arms, given.rates):
             torch.manual_seed(seed)
-            method, begun = build_method(ARMS[arm]), time.process_time()
-            length = steps if any(True for _ in method.parameters()) else 0
-            if (arm, str(seed), str(length)) in known or (seed and not length):
+            method, begun = build_method(arms[arm]), time.process_time()
+            trained = any(True for _ in method.parameters())
+            row = (arm, seed, given.steps if trained else 0, rate if trained else 0)
+            if tuple(map(str, row)) in known or (seed and not trained):
                 continue
-            if length:
-                train(method, A, views, volumes, seed)
+            if trained:
+                train(method, A, views, volumes, seed, given.steps, rate)
             seconds = round(time.process_time() - begun)
             for case, scores in enumerate(errors(method, A, *tests)):
-                writer.writerow([arm, seed, length, case, *(round(x, 4) for x in scores), seconds])
+                writer.writerow([*row, case, *(round(x, 4) for x in scores), seconds])
             file.flush()
 
 

@@ -33,7 +33,9 @@ def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None
 
     For a network, with random weights, so that zero-initialised layers take part: scaling the views
     scales the volume; gradients of the volume, or of its standard deviation, reach every parameter.
-    A method without parameters explains the views better than an empty volume.
+    A method without parameters explains the views better than an empty volume. Gradients in the
+    views, of methods that have them, are finite, also of empty views and of rows with
+    rounding at their ends.
 
     Args:
         name: name of the method.
@@ -65,6 +67,25 @@ def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None
             assert misfit < 1, f"the volume explains the views no better than zero does: {misfit:g}"
     out = method(views, A)
     check_gradients(method, out.volume if out.sigma is None else out.volume + out.sigma)
+    _check_input_gradients(method.float(), views.float(), A)
+
+
+def _check_input_gradients(
+    method: nn.Module, views: Float[Tensor, "2 1 m v u"], A: Projector
+) -> None:
+    rounding = 1e-12 * torch.rand(views.shape[-2:])
+    rounding[0] = 1  # the object reaches the detector's edge there
+    rounding[1::2, 2:-2] = 1
+    for values in (views + views.mean(), views.amax() * rounding, torch.zeros_like(views)):
+        values = values.expand_as(views).clone().requires_grad_()
+        try:
+            volume = method(values, A).volume
+        except ValueError:  # "Expected tensors without gradient"
+            return
+        if volume.requires_grad:
+            (slope,) = torch.autograd.grad(volume.square().sum(), values, allow_unused=True)
+            finite = slope is None or bool(slope.isfinite().all())
+            assert finite, "gradients in the views are not finite"
 
 
 def _check_volume(method: nn.Module, views: Float[Tensor, "2 1 m v u"], A: Projector) -> None:

@@ -163,13 +163,14 @@ def _behind(
     views: Float[Tensor, "*n u"], weights: Float[Tensor, "*#n u"], count: int
 ) -> Float[Tensor, "*n k"]:
     """The columns behind the last one; places are in units of a row."""
-    columns, tiny = views.shape[-1], torch.finfo(views.dtype).tiny
+    columns, known = views.shape[-1], torch.finfo(views.dtype)
     fitted = min(columns, max(MIN_FITTED, round(FITTED * columns)))
-    scale = views[..., -fitted:].detach().abs().amax(dim=-1, keepdim=True).clamp_min(tiny)
+    scale = views[..., -fitted:].detach().abs().amax(dim=-1, keepdim=True).clamp_min(known.tiny)
     views = views / scale
     value, slope, curvature = _parabola(views[..., -fitted:].square(), columns)
     edge = views[..., -max(1, round(EDGE * columns)) :].mean(dim=-1, keepdim=True)
-    value = torch.maximum(value, edge.square() / 4).clamp_min(tiny)
+    # rounding's square: quotients by less have gradients beyond the numbers
+    value = torch.maximum(value, edge.square() / 4).clamp_min(known.eps**2)
     slope = (slope / value).clamp_max(MAX_GROWTH)
     bend = torch.maximum(-curvature / value, 1 + slope).clamp_min(0)  # zero at a row's length
     apart = torch.arange(1, count + 1, device=views.device).to(views) / columns

@@ -357,10 +357,33 @@ def test_rows_of_an_ellipse_are_continued_exactly():
     _, behind = continuation(rows, torch.ones_like(rows), 101)
     truth = chords(1 + step * beyond)
     assert (behind - truth).abs().max() < 0.03 * rows.max()
-    empty = torch.zeros(1, 101, dtype=torch.float64, requires_grad=True)
+    empty = torch.zeros(1, 101, dtype=torch.float64)
     before, behind = continuation(empty, torch.ones_like(s), 101)
     assert not before.any() and not behind.any()
-    (slope,) = torch.autograd.grad(before.sum() + behind.sum(), empty)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("kind", ["empty", "rounding", "step", "one pixel", "negative", "ends"])
+def test_gradients_of_continued_rows_are_finite(kind, dtype):
+    """Rows of air, of rounding, of an object that ends just inside, of one pixel of it: whatever
+    the parabola at the edge is. The last kind is that of a beam behind a rod.
+    """
+    rows = torch.zeros(1, 64, dtype=dtype)
+    if kind == "rounding":
+        rows += torch.linspace(0, 1e-19, 64, dtype=dtype)
+    elif kind == "step":
+        rows[:, :60] = 3.0
+    elif kind == "one pixel":
+        rows[:, -1] = 1e-6
+        rows[:, 30] = 5.0
+    elif kind == "negative":
+        rows += -1e-3 * torch.linspace(-1, 1, 64, dtype=dtype).square()
+    elif kind == "ends":
+        rows += 1e-12 * torch.rand(64, generator=torch.Generator().manual_seed(0), dtype=dtype)
+        rows[:, 20:56] = 1.0
+    rows.requires_grad_()
+    before, behind = continuation(rows, torch.ones_like(rows), 64)
+    (slope,) = torch.autograd.grad(before.square().sum() + behind.sum(), rows)
     assert slope.isfinite().all()
 
 
