@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from itertools import cycle
@@ -18,7 +19,7 @@ from torch import Tensor
 from mvrecon import __version__
 from mvrecon.apps import compare, warmup
 from mvrecon.apps.config import compose, conf_dir, launch
-from mvrecon.apps.config.errors import sentence
+from mvrecon.apps.config.errors import one_line, sentence
 from mvrecon.apps.settings import ReconstructSettings, TrainSettings
 from mvrecon.core import registry
 from mvrecon.core.options import check, fits
@@ -87,6 +88,24 @@ def test_an_option_that_an_experiment_sets_for_another_method_has_a_remedy(answe
     assert "has no option 'support'. Known: " in (text := answer(*options))
     assert "; ~method.support removes it" in text
     check(compose(*options, "~method.support"), TrainSettings)
+
+
+def test_warnings_that_differ_in_numbers_alone_are_one_line_and_counted(
+    capsys: pytest.CaptureFixture[str],
+):
+    """As those of each step of a training are; other texts and other names are lines of their own."""
+    with one_line("mvrecon-train"):
+        for number in range(5):
+            text = f"In {number} of 8 views {number / 3:.1f}% are cut"
+            sys.stderr.write(warnings.formatwarning(text, UserWarning, "fdk.py", 3))
+        for name in ("a.tif", "b.tif"):
+            sys.stderr.write(warnings.formatwarning(f"{name}: 7 keys", UserWarning, "t.py", 1))
+    assert capsys.readouterr().err.splitlines() == [
+        "mvrecon-train: UserWarning: In 0 of 8 views 0.0% are cut",
+        "mvrecon-train: UserWarning: a.tif: 7 keys",
+        "mvrecon-train: UserWarning: b.tif: 7 keys",
+        "mvrecon-train: 4 further warnings repeat these with other numbers",
+    ]
 
 
 @pytest.mark.parametrize("override", MISTAKES)

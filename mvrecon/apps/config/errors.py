@@ -4,6 +4,7 @@ import os
 import re
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import wraps
@@ -47,7 +48,8 @@ INSTALLED_BY = {
 @contextmanager
 def one_line(app: str) -> Iterator[None]:
     """Context in which a user's error ends the process with status 1 and, like a warning, is one
-    line.
+    line. Of warnings that differ in their numbers alone, such as those of each step of a training,
+    the first one is printed, and at the end how many followed.
 
     Args:
         app: name of the app, with which the line begins.
@@ -56,9 +58,15 @@ def one_line(app: str) -> Iterator[None]:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
     """
     traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
-    warnings.formatwarning = lambda message, category, *_, **__: (
-        f"{app}: {category.__name__}: {message}\n"
-    )
+    given: Counter[str] = Counter()
+
+    def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> str:
+        text = f"{app}: {category.__name__}: {message}\n"
+        kind = re.sub(r"\d+", "", text)
+        given[kind] += 1
+        return text if given[kind] == 1 else ""
+
+    warnings.formatwarning = line
     os.environ[FULL_ERROR] = "1"  # Hydra's own report is several lines; so it raises the error
     try:
         yield
@@ -80,6 +88,8 @@ def one_line(app: str) -> Iterator[None]:
         else:
             os.environ[FULL_ERROR] = traceback_asked
         warnings.formatwarning = shown
+        if more := given.total() - len(given):
+            sys.stderr.write(f"{app}: {more} further warnings repeat these with other numbers\n")
 
 
 class TaskFailed(BaseException):
