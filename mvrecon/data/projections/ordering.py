@@ -85,10 +85,14 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
                 f"{where}: expected one file of every number, got {shown(first.name)} and "
                 f"{shown(second.name)}"
             )
+    sequence, _, values = _sorted(paths, exponents + INTEGER)
+    whole = [values[path][1::2] for path in files]
+    if sequence == files and _counts_by_one(whole):  # 1.1 to 1.9, 2.1 to 2.9
+        readings.append(whole)
     if all(map(_missing, readings)):
         if not gaps:
             check_steps(where, rows)
-        if _sorted(paths, exponents + INTEGER)[0] != files:  # and no steps decide between them
+        if sequence != files:  # and no steps decide between them
             warnings.warn(
                 f"{where}: the numbers in the names of the views are taken for decimals: "
                 f"{', '.join(path.name for path in files[:4])}, ...",
@@ -163,6 +167,11 @@ def _counted(pattern: str, stems: Sequence[str]) -> bool:
     places = [re.split("[.,]", text)[1] for stem in stems for text in re.findall(pattern, stem)]
     ends = any(len(part) > 1 and part.endswith("0") for part in places)
     return ends and len({*map(len, places)}) > 1
+
+
+def _counts_by_one(numbers: Sequence[Sequence[Any]]) -> bool:
+    """Whether each number of these names takes all values from its least to its greatest."""
+    return all(max(column) - min(column) < len({*column}) for column in zip(*numbers, strict=False))
 
 
 def check_steps(where: Path, numbers: Sequence[Sequence[Any]]) -> None:

@@ -191,6 +191,9 @@ def test_decimals_in_names_decide_the_order(tmp_path):
         ["1.2.9", "1.2.10", "1.2.11"],
         ["p_.25", "p_.5", "p_.75"],
         ["p_8.5", "p_9.5", "p_10.5"],
+        [f"{row}.{k}" for row in (1, 2, 3) for k in range(1, 10)],  # a table: no 2.0 is missing
+        [f"a{row}.{k} b" for row in (0, 1) for k in range(3)],
+        [f"{row}.{k:02}" for row in (9, 10) for k in range(1, 12)],
     ):
         paths = [tmp_path / f"{name}.tif" for name in names]
         assert ordered(paths[::-1]) == paths
@@ -200,6 +203,10 @@ def test_decimals_in_names_decide_the_order(tmp_path):
     "names",
     [
         ["p_0.0", "p_0.25", "p_0.75"],
+        ["p_0.00", "p_0.25", "p_1.00", "p_1.25"],
+        ["p_0.5", "p_1.0", "p_2.0", "p_2.5"],
+        [f"{row}.{k}" for row in (1, 2) for k in range(1, 10)][:-1],
+        [f"{row}.{k}" for row in (1, 3) for k in range(1, 10)],
         ["p_0.1", "p_0.2", "p_0.4"],
         ["p1.8", "p1.9", "p1.11"],
         ["a1_1", "a1_2", "a1_3", "a2_1", "a2_3"],
