@@ -10,6 +10,7 @@ from contextlib import chdir
 from dataclasses import fields, replace
 from functools import cache, wraps
 from io import TextIOWrapper
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar
@@ -37,7 +38,7 @@ from mvrecon.apps.config.choices import (
 )
 from mvrecon.apps.config.errors import one_line, reported
 from mvrecon.apps.config.grammar import MULTIRUN, CommandLine
-from mvrecon.apps.config.help import help_text
+from mvrecon.apps.config.help import example_of, help_text
 from mvrecon.apps.settings import RECORDS
 from mvrecon.core.files.checks import file_in, from_home
 from mvrecon.core.files.runs import of_weights
@@ -55,6 +56,8 @@ from mvrecon.core.signatures import alternatives
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 LOGGER_EXTRAS = {"wandb", "mlflow"}
+#: Flags that a word follows.
+FLAGS_OF_WORDS = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd"}
 #: Types of settings that are texts.
 TEXT_TYPES = {str, Path, NoneType}
 #: A dataclass of all settings of an app.
@@ -178,10 +181,16 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     stored as choices.
 
     Raises:
-        LookupError, TypeError: a group that the app does not choose from, or none of it; an
-            experiment of another app.
+        LookupError, TypeError: a word that sets nothing; a group that the app does not choose from,
+            or none of it; an experiment of another app.
         PermissionError, Refused, FileNotFoundError: see `guard.store_foreign`.
     """
+    for before, word in pairwise(["", *arguments]):
+        if not word.startswith(("-", "~")) and "=" not in word and before not in FLAGS_OF_WORDS:
+            raise LookupError(
+                f"Expected settings as key=value, such as {example_of(app)}, got {word!r}; --help "
+                f"lists them"
+            )
     prepare_hydra()
     settings = fields(record) if record else ()
     sections = [setting.name for setting in settings if is_section(setting.type)]
