@@ -181,7 +181,27 @@ def test_names_of_exposures_are_no_paths(name: str, folder: Path, monkeypatch):
     assert expanded([f"scan={folder}"]) == expected
 
 
-@pytest.mark.parametrize("pattern", ["scan [0-9]*.tif", "a, (b) = {c}_*", "it's \"*", "view_*.tif"])
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        *("scan [0-9]*.tif", "a, (b) = {c}_*", "it's \"*", "view_*.tif"),
+        *(
+            "001*",
+            "1e1",
+            "null",
+            "2020",
+            "007",
+            "true",
+            ".5",
+            "nan",
+            " a ",
+            "1_0",
+            "a,b",
+            "~",
+            "on",
+        ),
+    ],
+)
 def test_patterns_and_names_of_data_sets_are_kept_with_any_characters(pattern: str, folder: Path):
     """As `save` writes them and Hydra reads them; what refers or controls terminals is refused."""
     views = {"pattern": pattern, "dataset": f"/entry/{pattern}"}
@@ -190,6 +210,7 @@ def test_patterns_and_names_of_data_sets_are_kept_with_any_characters(pattern: s
     assert {one.key_or_group: one.value() for one in told} == {
         f"views.{name}": text for name, text in views.items()
     }
+    assert yaml.safe_load((folder / NAME).read_text()) == {"views": views}
     for odd in ("\\x24{every}", "a\\nb", "\\x1b[2J"):
         (folder / NAME).write_text(f'views: {{pattern: "{odd}"}}')
         with pytest.raises(Refused, match=r"as views.pattern, got"):

@@ -50,7 +50,7 @@ from mvrecon.core.options import (
     with_paths,
 )
 from mvrecon.core.parts import REGISTRIES
-from mvrecon.core.quantities import INSIDE_MARK, WEIGHTS_MARK
+from mvrecon.core.quantities import FILE_MARK, INSIDE_MARK, WEIGHTS_MARK
 from mvrecon.core.registry import check_options, hint, import_plugins, locate
 from mvrecon.core.signatures import alternatives
 
@@ -317,7 +317,7 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
 
     def absolute(path: str, marks: tuple) -> str:
         if INSIDE_MARK in marks:
-            return str(file_in(Path.cwd(), path) or path)
+            return str(file_in(Path.cwd(), path, FILE_MARK not in marks) or path)
         return str(of_weights(path) if WEIGHTS_MARK in marks else from_home(path).absolute())
 
     return with_paths(settings, record, absolute)

@@ -150,6 +150,13 @@ def quoted(value: str | Sequence[str]) -> str:
     return QuotedString(value, Quote.single).with_quotes()
 
 
+def as_text(value: str) -> str:
+    """A text as it is, or in quotes where Hydra would read another, a number or null."""
+    override = _override(value)
+    same = override and not override.is_sweep_override() and override.value() == value
+    return value if same else quoted(value)
+
+
 def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool = False) -> str:
     """A typed value in Hydra's grammar.
 

@@ -161,12 +161,13 @@ def from_home(path: str | os.PathLike[str]) -> Path:
     return Path(os.path.expanduser(path))
 
 
-def file_in(folder: Path, path: str) -> Path | None:
-    """The absolute path, from a folder, of a file or of a data set as <file>:<name>; None if there
-    is no such file.
+def file_in(folder: Path, path: str, folders: bool = True) -> Path | None:
+    """The absolute path, from a folder, of a file, folder (unless `folders` is false), or data set
+    as <file>:<name>; None if there is no such file.
     """
     head, sign, name = path.rpartition(":")
-    if (whole := folder.absolute() / from_home(path)).exists():
+    whole = folder.absolute() / from_home(path)
+    if whole.is_file() or (folders and whole.exists()):
         return whole
     place = folder.absolute() / from_home(head)
     return Path(f"{place}:{name}") if sign and place.is_file() else None
