@@ -19,7 +19,7 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString, Valu
 from hydra.errors import HydraException
 
 from mvrecon.apps.settings import SECTIONS
-from mvrecon.core.files.checks import file_in
+from mvrecon.core.files.checks import Refused, file_in
 from mvrecon.core.machine import world
 from mvrecon.core.parts import LISTED
 from mvrecon.core.signatures import alternatives, describe, describe_section
@@ -28,6 +28,7 @@ from mvrecon.core.signatures import alternatives, describe, describe_section
 GRAMMAR_CHARACTERS = set("=,;()[]{}' ")
 #: Hydra's own settings that are texts.
 HYDRA_TEXTS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
+NUMBERS = {int, float, bool}
 #: Arguments that ask for a sweep.
 MULTIRUN = {"-m", "--multirun", "hydra.mode=MULTIRUN"}
 #: Texts in quotes, or single characters.
@@ -172,15 +173,23 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
     mended = _mended(value, sweeps)
     override, is_name = _override(mended), key in (*names, *HYDRA_TEXTS)
     if override is None:  # brackets that do not close
-        return quoted(value) if is_name or _is_path(key) else value
+        return quoted(value) if is_name or _is_text(key) else value
     if override.value_type is ValueType.SIMPLE_CHOICE_SWEEP and not sweeps:
-        return quoted(value) if is_name or _is_path(key) else mended
+        return quoted(value) if is_name or _is_text(key) else mended
     plain = None if override.is_sweep_override() else override.value()
     if plain is None or isinstance(plain, str):
         return mended
     if is_name:
         return quoted(value)
-    return quoted(value) if _exists(value) and _path_without_numbers(key) else mended
+    if _exists(value) and _is_text(key):
+        if not (numbers := [members for members in _members(key) if NUMBERS & members]):
+            return quoted(value)
+        if any(Path in members for members in numbers):
+            raise Refused(
+                f"{key}={value} is a number, and there is a file or folder of this name: write "
+                f"./{value} for that, and {value}.0 or the like for the number"
+            )
+    return mended
 
 
 def _override(value: str) -> Override | None:
@@ -229,16 +238,14 @@ def _exists(value: str) -> bool:
         return False
 
 
-def _is_path(key: str) -> bool:
-    """Whether an option of a part or section with this name is a path."""
-    found = _types().get(key.rpartition(".")[2], []) if "." in key else []
-    return any(Path in members for members in found)
+def _is_text(key: str) -> bool:
+    """Whether an option of a part or section with this name is a text or a path."""
+    return any({str, Path} & members for members in _members(key))
 
 
-def _path_without_numbers(key: str) -> bool:
-    """Whether such an option is a path, and none is a number."""
-    found = _types().get(key.rpartition(".")[2], []) if "." in key else []
-    return _is_path(key) and not any({int, float, bool} & members for members in found)
+def _members(key: str) -> list[set[Any]]:
+    """The types of all options of parts and sections with this name."""
+    return _types().get(key.rpartition(".")[2], []) if "." in key else []
 
 
 @cache
