@@ -154,13 +154,14 @@ def test_paths_may_look_like_numbers_and_dates(folder: Path, monkeypatch, name: 
         assert told == {"views.path": path, "views.pattern": name, "views.bad_pixels": path}
 
 
-def test_a_number_that_is_the_name_of_a_file_is_asked_for(folder: Path, monkeypatch):
-    """On a command line; in a description the file is taken. A number of another form is one."""
+@pytest.mark.filterwarnings("error")
+def test_a_number_that_is_the_name_of_a_file_is_named(folder: Path, monkeypatch):
+    """On a command line; in a description the file is taken. Also tried: exponents, files."""
     monkeypatch.chdir(folder)
     (folder / "2020").mkdir()
     for key in ("views.flat", "views.dark"):
-        with pytest.raises(Refused, match=rf"{key}=2020 is a number, and .* write ./2020 for"):
-            CommandLine.of([f"{key}=2020"])
+        with pytest.warns(UserWarning, match=rf"{key}=2020 is taken for a number.*{key}=./2020"):
+            assert CommandLine.of([f"{key}=2020"]).overrides == [f"{key}=2020"]
         for word in (f"{key}=./2020", f"{key}=2020.0", f"{key}=2021"):
             assert CommandLine.of([word]).overrides == [word]
     assert CommandLine.of(["camera.n_views=2020"]).overrides == ["camera.n_views=2020"]

@@ -7,6 +7,7 @@ interpolations.
 """
 
 import re
+import warnings
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString, Valu
 from hydra.errors import HydraException
 
 from mvrecon.apps.settings import SECTIONS
-from mvrecon.core.files.checks import Refused, file_in
+from mvrecon.core.files.checks import file_in
 from mvrecon.core.machine import world
 from mvrecon.core.parts import LISTED
 from mvrecon.core.signatures import alternatives, describe, describe_section
@@ -167,6 +168,9 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
             text, whatever is in its name.
         names: settings of the app that are texts, also where a number is typed.
         sweeps: whether commas separate the values of a sweep.
+
+    Warns:
+        UserWarning: a number that is also the name of a file, of an option that takes both.
     """
     if _exists(value) and GRAMMAR_CHARACTERS & set(value):
         return quoted(value)
@@ -185,9 +189,10 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
         if not (numbers := [members for members in _members(key) if NUMBERS & members]):
             return quoted(value)
         if any(Path in members for members in numbers):
-            raise Refused(
-                f"{key}={value} is a number, and there is a file or folder of this name: write "
-                f"./{value} for that, and {value}.0 or the like for the number"
+            warnings.warn(
+                f"{key}={value} is taken for a number, not for what is here by this name; "
+                f"{key}=./{value} is that",
+                stacklevel=2,
             )
     return mended
 
