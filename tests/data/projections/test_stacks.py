@@ -200,6 +200,26 @@ def test_decimals_in_names_decide_the_order(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "warned"),
+    [
+        ("s_{angle:03}_{k:04}", True),
+        ("s1_{angle}_{k}", True),
+        ("{energy}_{k:04}", True),
+        ("s_{k:04}_{angle:03}", False),
+        ("s_{k:04}_{energy}", False),
+        ("s_{ms}_{k}", False),
+    ],
+)
+def test_a_counter_in_another_order_than_the_first_number_is_named(name, warned, tmp_path):
+    """As of angles beyond a turn before the number of the view. Also tried: turns, random names."""
+    names = [name.format(k=k, angle=25 * k % 360, energy=1 + k % 2, ms=41 * k) for k in range(24)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ordered([tmp_path / f"{name}.tif" for name in names])
+    assert ["a later one does not run" in str(one.message) for one in caught] == [True] * warned
+
+
+@pytest.mark.parametrize(
     "names",
     [
         ["p_0.0", "p_0.25", "p_0.75"],
