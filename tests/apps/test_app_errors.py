@@ -112,7 +112,12 @@ WORDS = {
 
 @pytest.mark.parametrize("app", WORDS)
 @pytest.mark.parametrize(
-    "words", [["a.h5"], ["seed=1", "a b"], ["-m", "out"], ["--cfg", "job", "scan/x.yaml"]]
+    "words",
+    [
+        *(["a.h5"], ["seed=1", "a b"], ["-m", "out"], ["--cfg", "job", "scan/x.yaml"]),
+        *(["grid[size]=8"], ["gríd.size=8"], ["grid.size =8"], ["=8"], ["+=8"], ["~"], [".a=1"]),
+        *(["a..b=1"], ["grid.=1"], ["\N{EM DASH}grid.size=8"], ["'grid.size=8'"]),
+    ],
 )
 def test_a_word_that_sets_nothing_is_answered_by_an_example(app: str, words: list[str], answer):
     """Also tried: names of settings, experiments and methods, +, the apps of plugins."""

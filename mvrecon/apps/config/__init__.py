@@ -4,6 +4,7 @@ Importing this file imports neither torch nor Lightning; a check imports the par
 """
 
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
@@ -56,6 +57,8 @@ from mvrecon.core.signatures import alternatives
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 LOGGER_EXTRAS = {"wandb", "mlflow"}
+#: Beginnings of words that set something, by keys in Hydra's grammar, or are flags.
+SETTING = re.compile(r"-|(~|\+{0,2}(?=[^=]+=))[\w/@:-]+(\.[\w/@:-]+)*(=|$)", re.ASCII)
 #: Flags that a word follows.
 FLAGS_OF_WORDS = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd"}
 #: Types of settings that are texts.
@@ -186,7 +189,7 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
         PermissionError, Refused, FileNotFoundError: see `guard.store_foreign`.
     """
     for before, word in pairwise(["", *arguments]):
-        if not word.startswith(("-", "~")) and "=" not in word and before not in FLAGS_OF_WORDS:
+        if not (SETTING.match(word) or before in FLAGS_OF_WORDS):
             raise LookupError(
                 f"Expected settings as key=value, such as {example_of(app)}, got {word!r}; --help "
                 f"lists them"
