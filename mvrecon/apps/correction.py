@@ -41,7 +41,7 @@ from mvrecon.operators.operator import LinearOperator
 
 #: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
 MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
-#: Share of the line integrals beside the grid from which on the object extends beyond it: views of
+#: Share of the line integrals outside the grid from which on the object extends beyond it: views of
 #: a ball are aligned on a grid that misses 0.001 of them, and no longer where it misses 0.016.
 MAX_BESIDE = 0.005
 #: Arrays of the views' size that a fit holds.

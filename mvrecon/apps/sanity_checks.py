@@ -158,7 +158,7 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float, beside: float) -> st
         )
     if beside > MIN_BESIDE:
         return (
-            f"{beside:.0%} of the line integrals are those of rays beside the grid, which no "
+            f"{beside:.0%} of the line integrals are those of rays outside the grid, which no "
             f"volume on it explains: is it as large as the object?"
         )
     part = METHODS.get(method)

@@ -11,12 +11,13 @@ import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from mvrecon.apps.config.grammar import quoted
+from mvrecon.apps.config.grammar import as_text
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import (
@@ -29,22 +30,29 @@ from mvrecon.core.files.checks import (
 )
 from mvrecon.core.options import with_paths
 from mvrecon.core.parts import VIEW_FILES
-from mvrecon.core.quantities import INSIDE_MARK
+from mvrecon.core.quantities import FILE_MARK, INSIDE_MARK
 from mvrecon.core.registry import hint
 
 NAME, KEY = "scan.yaml", "scan"
 #: The sections of the file: those of `mvrecon-reconstruct` that a scan determines.
 SECTIONS = ("views", "camera", "projector", "grid")
-#: Options whose texts may have any characters except control characters.
+#: Options whose texts may have any characters except control characters, as names of data sets.
 TEXTS = ("views.pattern", "views.dataset")
 #: Values: numbers, words, products of names or patterns of them, and paths; nothing that refers.
 WORD, NAMED = re.compile(r"[\w.+*?/-]+( [*] [\w./-]+)*"), re.compile(r"[\w.+/: -]+")
-#: Numbers that YAML 1.1 reads as texts, as they have no point or no sign of the exponent.
-NUMBER = re.compile(r"[-+]?[0-9.]+[eE][-+]?[0-9]+")
-#: Beginnings of texts that name a file, not a data set of the scan's own.
-FILE = re.compile(r"[.~]|[^:]*:")
+#: Texts that are numbers where an option takes them, unless they are names of files.
+NUMBER = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
 #: What OmegaConf would resolve, outside of comments.
 REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
+
+
+class AsTyped(yaml.SafeLoader):
+    """Reads numbers and dates as texts: names of files and data sets may look like these."""
+
+    yaml_implicit_resolvers = {
+        start: [pair for pair in pairs if not pair[0].endswith((":int", ":float", ":timestamp"))]
+        for start, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
 
 
 def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> None:
@@ -52,19 +60,20 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
     working folder, are written as they begin in the file's.
     """
     told = {key: dict(value) for key, value in description.items() if value is not None}
-    told = with_paths(told, ReconstructSettings, lambda path, _: _from_folder(file.parent, path))
+    told = with_paths(told, ReconstructSettings, partial(_from_folder, file.parent))
     with written_whole(file) as part:
         part.write_text(yaml.safe_dump(told, sort_keys=False), encoding="utf-8")
 
 
-def _from_folder(folder: Path, path: str) -> str:
+def _from_folder(folder: Path, path: str, marks: tuple) -> str:
     """A path as it begins in a folder: of a file, or of a data set as <file>:<name>; the name of a
     data set alone, which is no file, begins at the root.
     """
     whole, (head, sign, name) = from_home(path), str(path).rpartition(":")
-    if not whole.exists() and not sign:
+    there = whole.is_file() if FILE_MARK in marks else whole.exists()
+    if not there and not sign:
         return _from_root(path)
-    place, rest = (whole, "") if whole.exists() else (from_home(head), sign + name)
+    place, rest = (whole, "") if there else (from_home(head), sign + name)
     return os.path.relpath(place.resolve(), folder.resolve()) + rest
 
 
@@ -124,7 +133,7 @@ def _settings(file: Path) -> Iterator[str]:
             f"{file}: expected plain values, got {refers[1]}, which is not resolved in {NAME}; "
             f"write what it stands for, paths as they begin in its folder"
         )
-    told = yaml_of(file)
+    told = yaml_of(file, AsTyped)
     if not isinstance(told, dict) or not all(isinstance(part, dict) for part in told.values()):
         raise Refused(f"{file}: expected sections such as views: {{path: projections}}")
     if unknown := sorted(map(str, set(told) - set(SECTIONS))):
@@ -137,12 +146,13 @@ def _settings(file: Path) -> Iterator[str]:
     hdf5 = ending in VIEW_FILES.names() and VIEW_FILES.takes(ending, "angles")
 
     def from_file(path: str, marks: tuple) -> str | Path:
-        if (found := file_in(file.parent, path)) is not None:
+        if path and (found := file_in(file.parent, path, FILE_MARK not in marks)) is not None:
             return found
-        if NUMBER.fullmatch(path):
+        if not path or (NUMBER.fullmatch(path) and INSIDE_MARK in marks and FILE_MARK not in marks):
             return path
-        inside = INSIDE_MARK in marks and (hdf5 or views is None) and not FILE.match(path)
-        return _from_root(path) if inside else file.parent / from_home(path)
+        inside = INSIDE_MARK in marks and (hdf5 or views is None)
+        named = inside and path[:1] not in (".", "~") and ":" not in path
+        return _from_root(path) if named else file.parent / from_home(path)
 
     told = with_paths(told, ReconstructSettings, from_file)
     for section, options in told.items():
@@ -173,8 +183,9 @@ def _word(file: Path, key: str, value: Any) -> str:
             return str(value.absolute())
     elif value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
-    elif isinstance(value, str | int | float) and WORD.fullmatch(str(value)):
+    elif key in TEXTS or (key.startswith("views.") and value[:1] == "/"):
+        if value.isprintable() and "${" not in value:
+            return as_text(value)
+    elif WORD.fullmatch(str(value)):
         return str(value)
-    elif isinstance(value, str) and key in TEXTS and value.isprintable() and "${" not in value:
-        return quoted(value)
     raise Refused(f"{file}: expected a number, a word or a file as {key}, got {str(value)!r}")

@@ -21,9 +21,10 @@ Triple: TypeAlias = Annotated[Sequence[T], Len(3, 3)]
 
 #: Marks a path that may also be the name of weights that mvrecon ships.
 WEIGHTS_MARK = "weights"
-#: Marks a path that may also be the name of a data set in the scan's file.
-INSIDE_MARK = "inside"
+#: Mark a path that may also be the name of a data set in the scan's file, and one of no folder.
+INSIDE_MARK, FILE_MARK = "inside", "file"
 #: A path of weights, or their name.
 WeightsFile: TypeAlias = Annotated[str | Path, WEIGHTS_MARK]
-#: A path, or the name of a data set in the scan's file.
-InsideOrFile: TypeAlias = Annotated[str | Path, INSIDE_MARK]
+#: A path, or that of a file, or else the name of a data set in the scan's file.
+InsideOrPath: TypeAlias = Annotated[str | Path, INSIDE_MARK]
+InsideOrFile: TypeAlias = Annotated[InsideOrPath, FILE_MARK]

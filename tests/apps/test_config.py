@@ -266,6 +266,14 @@ def test_a_number_is_a_path_where_the_option_takes_no_number(
     assert CommandLine.of(lines).overrides == ["views.path='2024_01'", *lines[1:]]
 
 
+@pytest.mark.parametrize("text", ["a,b", "[a", "{a", "[", "scan_[12", "a, {b}c"])
+def test_texts_of_sections_are_texts_whatever_hydra_would_read(text: str):
+    """Patterns and names of data sets as well as paths; also tried: options of parts."""
+    for key in ("views.pattern", "views.dataset", "views.path", "scene.path"):
+        (line,) = CommandLine.of([f"{key}={text}"]).overrides
+        assert OverridesParser.create().parse_override(line).value() == text
+
+
 def test_folders_of_configs_may_have_any_characters(tmp_path: Path):
     folder = tmp_path / "für (mich), o'brien [1]"
     (folder / "experiment").mkdir(parents=True)

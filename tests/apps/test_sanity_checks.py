@@ -91,7 +91,7 @@ def test_a_grid_of_a_part_of_the_object_is_named_where_the_method_needs_all_of_i
     scan = replace(scan_of(views), grid=PARTS[name])
     assert checked(scan, "fdk", 0.8) == []
     (words,) = checked(scan, "sirt", 0.8)
-    share = int(re.search(r"(\d+)% of the line integrals .* beside the grid", words)[1])
+    share = int(re.search(r"(\d+)% of the line integrals .* outside the grid", words)[1])
     A = Drr(PARTS[name], RIG[:1])
     missed = A(torch.ones(1, 1, *A.domain_shape))[0, 0] == 0
     beside = (views[:1] * missed).sum() / views[:1].sum()

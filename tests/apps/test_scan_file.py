@@ -71,6 +71,8 @@ def test_the_only_case_of_a_simulation_is_found_and_several_are_named(folder: Pa
         ({"camera": {"name": "arc sid=3"}}, "as camera, got"),
         ({"camera": {"sid=3 out": 1}}, "expected names of settings in camera"),
         ("views: [", "expected sections"),
+        ({"views": {"path": ""}}, "a file as views.path, got ''"),
+        ({"views": {"path": "a.h5", "angles": ""}}, "a file as views.angles, got ''"),
         ({"views": {"path": "a*"}}, "as views.path, got"),
         ({"camera": {"name": "circular", "detector": "/etc ="}}, "as camera.detector, got"),
     ],
@@ -114,7 +116,7 @@ def test_paths_begin_in_the_folder_of_the_file_and_words_are_no_paths(folder: Pa
 
 
 def test_paths_from_home_and_numbers_with_an_exponent(folder: Path, monkeypatch):
-    """YAML takes 5e4 for a text, which is a number unless it is the name of a file."""
+    """5e4, a text in YAML, is a number unless it is the name of a file."""
     home = folder / "home"
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))
@@ -129,6 +131,53 @@ def test_paths_from_home_and_numbers_with_an_exponent(folder: Path, monkeypatch)
         f"views.dark={folder}/1e3",
         "views.floor=1e-5",
     ]
+
+
+@pytest.mark.parametrize("name", ["2020", "001", "20240131", "2024-01-31", "12:30", "1_0", "1.5"])
+def test_paths_may_look_like_numbers_and_dates(folder: Path, monkeypatch, name: str):
+    """As they are typed, in the folder of the file and never in the working folder, where others
+    of the name they would have as numbers may be; a pattern is a text.
+    """
+    for number in (name, str(yaml.safe_load(name))):
+        (folder / "else" / number).mkdir(parents=True, exist_ok=True)
+    monkeypatch.chdir(folder / "else")
+    for there in (False, True):
+        if there:
+            (folder / name).mkdir()
+        (folder / NAME).write_text(f"views: {{path: {name}, pattern: {name}, bad_pixels: {name}}}")
+        words = CommandLine.of(expanded([f"scan={folder}"])).overrides
+        told = {
+            word.key_or_group: word.value()
+            for word in OverridesParser.create().parse_overrides(words)
+        }
+        path = str(folder / name)
+        assert told == {"views.path": path, "views.pattern": name, "views.bad_pixels": path}
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_number_that_is_the_name_of_a_file_is_named(folder: Path, monkeypatch):
+    """On a command line; in a description the file is taken. Also tried: exponents, files."""
+    monkeypatch.chdir(folder)
+    (folder / "2020").mkdir()
+    for key in ("views.flat", "views.dark"):
+        with pytest.warns(UserWarning, match=rf"{key}=2020 is taken for a number.*{key}=./2020"):
+            assert CommandLine.of([f"{key}=2020"]).overrides == [f"{key}=2020"]
+        for word in (f"{key}=./2020", f"{key}=2020.0", f"{key}=2021"):
+            assert CommandLine.of([word]).overrides == [word]
+    assert CommandLine.of(["camera.n_views=2020"]).overrides == ["camera.n_views=2020"]
+    assert CommandLine.of(["views.path=2020"]).overrides == ["views.path='2020'"]
+    (folder / NAME).write_text("views: {path: projections, flat: 2020, dark: 2021}")
+    told = expanded([f"scan={folder}"])
+    assert told[1:] == [f"views.flat={folder}/2020", "views.dark=2021"]
+
+
+@pytest.mark.parametrize("name", ["a b (c)", "a,b", "x=1", "[0]", "it's", "a#b", "ä", "{x}", "%$!"])
+def test_names_of_data_sets_may_have_any_characters(folder: Path, name: str):
+    """As `save` writes them; also tried: every option of views that has names."""
+    keys = ("angles", "image_key", "flat", "dark", "exposure")
+    save(folder / NAME, {"views": {"path": "a.h5", **dict.fromkeys(keys, f"entry/{name}")}})
+    told = OverridesParser.create().parse_overrides(expanded([f"scan={folder}"]))
+    assert {one.value() for one in told[1:]} == {f"/entry/{name}"}
 
 
 def test_names_of_data_sets_are_no_paths(folder: Path):
@@ -181,7 +230,27 @@ def test_names_of_exposures_are_no_paths(name: str, folder: Path, monkeypatch):
     assert expanded([f"scan={folder}"]) == expected
 
 
-@pytest.mark.parametrize("pattern", ["scan [0-9]*.tif", "a, (b) = {c}_*", "it's \"*", "view_*.tif"])
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        *("scan [0-9]*.tif", "a, (b) = {c}_*", "it's \"*", "view_*.tif"),
+        *(
+            "001*",
+            "1e1",
+            "null",
+            "2020",
+            "007",
+            "true",
+            ".5",
+            "nan",
+            " a ",
+            "1_0",
+            "a,b",
+            "~",
+            "on",
+        ),
+    ],
+)
 def test_patterns_and_names_of_data_sets_are_kept_with_any_characters(pattern: str, folder: Path):
     """As `save` writes them and Hydra reads them; what refers or controls terminals is refused."""
     views = {"pattern": pattern, "dataset": f"/entry/{pattern}"}
@@ -190,6 +259,7 @@ def test_patterns_and_names_of_data_sets_are_kept_with_any_characters(pattern: s
     assert {one.key_or_group: one.value() for one in told} == {
         f"views.{name}": text for name, text in views.items()
     }
+    assert yaml.safe_load((folder / NAME).read_text()) == {"views": views}
     for odd in ("\\x24{every}", "a\\nb", "\\x1b[2J"):
         (folder / NAME).write_text(f'views: {{pattern: "{odd}"}}')
         with pytest.raises(Refused, match=r"as views.pattern, got"):

@@ -4,12 +4,14 @@ Importing this file imports neither torch nor Lightning; a check imports the par
 """
 
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import chdir
 from dataclasses import fields, replace
 from functools import cache, wraps
 from io import TextIOWrapper
+from itertools import pairwise
 from pathlib import Path
 from types import NoneType
 from typing import Any, TypeVar
@@ -37,7 +39,7 @@ from mvrecon.apps.config.choices import (
 )
 from mvrecon.apps.config.errors import one_line, reported
 from mvrecon.apps.config.grammar import MULTIRUN, CommandLine
-from mvrecon.apps.config.help import help_text
+from mvrecon.apps.config.help import example_of, help_text
 from mvrecon.apps.settings import RECORDS
 from mvrecon.core.files.checks import file_in, from_home
 from mvrecon.core.files.runs import of_weights
@@ -49,12 +51,16 @@ from mvrecon.core.options import (
     with_paths,
 )
 from mvrecon.core.parts import REGISTRIES
-from mvrecon.core.quantities import INSIDE_MARK, WEIGHTS_MARK
+from mvrecon.core.quantities import FILE_MARK, INSIDE_MARK, WEIGHTS_MARK
 from mvrecon.core.registry import check_options, hint, import_plugins, locate
 from mvrecon.core.signatures import alternatives
 
 #: Loggers of conf/logger that need a package, which the extra of the same name installs.
 LOGGER_EXTRAS = {"wandb", "mlflow"}
+#: Beginnings of words that set something, by keys in Hydra's grammar, or are flags.
+SETTING = re.compile(r"-|(~|\+{0,2}(?=[^=]+=))[\w/@:-]+(\.[\w/@:-]+)*(=|$)", re.ASCII)
+#: Flags that a word follows.
+FLAGS_OF_WORDS = {"--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd"}
 #: Types of settings that are texts.
 TEXT_TYPES = {str, Path, NoneType}
 #: A dataclass of all settings of an app.
@@ -178,10 +184,16 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
     stored as choices.
 
     Raises:
-        LookupError, TypeError: a group that the app does not choose from, or none of it; an
-            experiment of another app.
+        LookupError, TypeError: a word that sets nothing; a group that the app does not choose from,
+            or none of it; an experiment of another app.
         PermissionError, Refused, FileNotFoundError: see `guard.store_foreign`.
     """
+    for before, word in pairwise(["", *arguments]):
+        if not (SETTING.match(word) or before in FLAGS_OF_WORDS):
+            raise LookupError(
+                f"Expected settings as key=value, such as {example_of(app)}, got {word!r}; --help "
+                f"lists them"
+            )
     prepare_hydra()
     settings = fields(record) if record else ()
     sections = [setting.name for setting in settings if is_section(setting.type)]
@@ -308,7 +320,7 @@ def absolute_paths(settings: Mapping[str, Any], record: type) -> dict[str, Any]:
 
     def absolute(path: str, marks: tuple) -> str:
         if INSIDE_MARK in marks:
-            return str(file_in(Path.cwd(), path) or path)
+            return str(file_in(Path.cwd(), path, FILE_MARK not in marks) or path)
         return str(of_weights(path) if WEIGHTS_MARK in marks else from_home(path).absolute())
 
     return with_paths(settings, record, absolute)

@@ -7,6 +7,7 @@ interpolations.
 """
 
 import re
+import warnings
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,6 +29,7 @@ from mvrecon.core.signatures import alternatives, describe, describe_section
 GRAMMAR_CHARACTERS = set("=,;()[]{}' ")
 #: Hydra's own settings that are texts.
 HYDRA_TEXTS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
+NUMBERS = {int, float, bool}
 #: Arguments that ask for a sweep.
 MULTIRUN = {"-m", "--multirun", "hydra.mode=MULTIRUN"}
 #: Texts in quotes, or single characters.
@@ -150,6 +152,13 @@ def quoted(value: str | Sequence[str]) -> str:
     return QuotedString(value, Quote.single).with_quotes()
 
 
+def as_text(value: str) -> str:
+    """A text as it is, or in quotes where Hydra would read another, a number or null."""
+    override = _override(value)
+    same = override and not override.is_sweep_override() and override.value() == value
+    return value if same else quoted(value)
+
+
 def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool = False) -> str:
     """A typed value in Hydra's grammar.
 
@@ -159,21 +168,33 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
             text, whatever is in its name.
         names: settings of the app that are texts, also where a number is typed.
         sweeps: whether commas separate the values of a sweep.
+
+    Warns:
+        UserWarning: a number that is also the name of a file, of an option that takes both.
     """
     if _exists(value) and GRAMMAR_CHARACTERS & set(value):
         return quoted(value)
     mended = _mended(value, sweeps)
     override, is_name = _override(mended), key in (*names, *HYDRA_TEXTS)
     if override is None:  # brackets that do not close
-        return quoted(value) if is_name or _is_path(key) else value
+        return quoted(value) if is_name or _is_text(key) else value
     if override.value_type is ValueType.SIMPLE_CHOICE_SWEEP and not sweeps:
-        return quoted(value) if is_name or _is_path(key) else mended
+        return quoted(value) if is_name or _is_text(key) else mended
     plain = None if override.is_sweep_override() else override.value()
     if plain is None or isinstance(plain, str):
         return mended
     if is_name:
         return quoted(value)
-    return quoted(value) if _exists(value) and _path_without_numbers(key) else mended
+    if _exists(value) and _is_text(key):
+        if not (numbers := [members for members in _members(key) if NUMBERS & members]):
+            return quoted(value)
+        if any(Path in members for members in numbers):
+            warnings.warn(
+                f"{key}={value} is taken for a number, not for what is here by this name; "
+                f"{key}=./{value} is that",
+                stacklevel=2,
+            )
+    return mended
 
 
 def _override(value: str) -> Override | None:
@@ -222,16 +243,14 @@ def _exists(value: str) -> bool:
         return False
 
 
-def _is_path(key: str) -> bool:
-    """Whether an option of a part or section with this name is a path."""
-    found = _types().get(key.rpartition(".")[2], []) if "." in key else []
-    return any(Path in members for members in found)
+def _is_text(key: str) -> bool:
+    """Whether an option of a part or section with this name is a text or a path."""
+    return any({str, Path} & members for members in _members(key))
 
 
-def _path_without_numbers(key: str) -> bool:
-    """Whether such an option is a path, and none is a number."""
-    found = _types().get(key.rpartition(".")[2], []) if "." in key else []
-    return _is_path(key) and not any({int, float, bool} & members for members in found)
+def _members(key: str) -> list[set[Any]]:
+    """The types of all options of parts and sections with this name."""
+    return _types().get(key.rpartition(".")[2], []) if "." in key else []
 
 
 @cache

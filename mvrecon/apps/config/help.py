@@ -58,6 +58,12 @@ def help_text(app: str, record: type | None = None) -> str:
     return "\n\n".join(parts) + "\n" + END
 
 
+def example_of(app: str) -> str:
+    """The first setting of the examples in an app's file of choices."""
+    example = re.search(r"^#   mvrecon-\S+ (\S+=\S+)", app_file(app).read_text("utf-8"), re.M)
+    return example[1] if example else "name=mine"
+
+
 def _entry(key: str, default: Any, *sentences: str) -> str:
     """A setting and its default as on a command line, and below it what it means."""
     value = re.sub(r'"([^"]*)"', r"\1", json.dumps(default)).replace("{}", "null")

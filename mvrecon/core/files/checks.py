@@ -111,19 +111,23 @@ def json_of(path: str | Path) -> Any:
     return json.loads(text_of(path), object_pairs_hook=unique)
 
 
-def yaml_of(path: str | Path) -> Any:
+def yaml_of(path: str | Path, loader: type | None = None) -> Any:
     """Read the plain values of a YAML file with at most `MAX_YAML_VALUES` values after expanding
     aliases.
+
+    Args:
+        path: path of the file.
+        loader: a class derived from PyYAML's SafeLoader; None: that itself.
 
     Raises:
         OSError: it cannot be read.
         Refused: too large, not UTF-8, not YAML, a tag of an object, a repeated name, or an
             explosion of aliases.
     """
-    return yaml_in(text_of(path, MAX_YAML_BYTES), path)
+    return yaml_in(text_of(path, MAX_YAML_BYTES), path, loader)
 
 
-def yaml_in(text: str, path: str | Path) -> Any:
+def yaml_in(text: str, path: str | Path, loader: type | None = None) -> Any:
     """The plain values of the text of a YAML file, see `yaml_of`.
 
     Raises:
@@ -132,11 +136,11 @@ def yaml_in(text: str, path: str | Path) -> Any:
     import yaml
 
     with file_errors(path, "is not YAML"):
-        loader = yaml.SafeLoader(text)
-        root = loader.get_single_node()
+        reader = (loader or yaml.SafeLoader)(text)
+        root = reader.get_single_node()
         if root is not None and _unfolded(root, {}) > MAX_YAML_VALUES:
             raise Refused(f"{path}: unfolds to more than {MAX_YAML_VALUES} values")
-        return None if root is None else loader.construct_document(root)
+        return None if root is None else reader.construct_document(root)
 
 
 def _unfolded(node: Any, sizes: dict[int, float]) -> float:
@@ -161,12 +165,13 @@ def from_home(path: str | os.PathLike[str]) -> Path:
     return Path(os.path.expanduser(path))
 
 
-def file_in(folder: Path, path: str) -> Path | None:
-    """The absolute path, from a folder, of a file or of a data set as <file>:<name>; None if there
-    is no such file.
+def file_in(folder: Path, path: str, folders: bool = True) -> Path | None:
+    """The absolute path, from a folder, of a file, folder (unless `folders` is false), or data set
+    as <file>:<name>; None if there is no such file.
     """
     head, sign, name = path.rpartition(":")
-    if (whole := folder.absolute() / from_home(path)).exists():
+    whole = folder.absolute() / from_home(path)
+    if whole.is_file() or (folders and whole.exists()):
         return whole
     place = folder.absolute() / from_home(head)
     return Path(f"{place}:{name}") if sign and place.is_file() else None

@@ -3,9 +3,10 @@
 """
 
 import math
+import posixpath
 import re
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from functools import lru_cache
 from html import unescape
 from pathlib import Path
@@ -109,7 +110,7 @@ def elements(text: str, name: str) -> list[tuple[int, dict[str, str]]]:
 
 @lru_cache(maxsize=4)
 def places_in_set(text: str) -> dict[str, list[PlaceInSet]]:
-    """The places of the pages of each file of a set, by the file's name, as OME's description
+    """The places of the pages of each file of a set, by the file's path, as OME's description
     states them; empty where it names fewer than two files.
     """
     pages: dict[str, list[tuple[int, PlaceInSet]]] = {}
@@ -127,11 +128,19 @@ def places_in_set(text: str) -> dict[str, list[PlaceInSet]]:
                 after = starts[bisect_right(starts, start) :]
                 count = (after[0] if after else math.prod(n for _, n in axes)) - start
             run = [(number, *_at(start + k, axes)) for k in range(1, min(count, VIEWS))]
-            those = pages.setdefault(unescape(name["FileName"]), [])
+            path = posixpath.normpath(unescape(name["FileName"]).replace("\\", "/"))
+            those = pages.setdefault(path, [])
             those += enumerate([_place(number, own, "First"), *run], first)
     if len(pages) < 2:
         return {}
     return {name: [place for _, place in sorted(those)] for name, those in pages.items()}
+
+
+def path_in_set(file: Path, places: Container[str]) -> str | None:
+    """The longest of the paths of a set in which that of a file ends; None of others."""
+    parts = file.absolute().parts
+    tails = ("/".join(parts[k:]) for k in range(1, len(parts)))
+    return next((tail for tail in tails if tail in places), None)
 
 
 def _axes(pixels: Mapping[str, str]) -> list[tuple[str, int]]:
@@ -236,16 +245,14 @@ def _of_dectris(file: Path, head: Header, entries: Mapping[str, str]) -> Header:
     return head._replace(stated=stated)
 
 
-def of_file(
-    file: Path, head: Header, text: str, places: Mapping[str, Sequence[PlaceInSet]]
-) -> Header:
+def of_file(file: Path, head: Header, text: str, own: Sequence[PlaceInSet]) -> Header:
     """The header of all pages, in the order of the images, with what OME states of them.
 
     Args:
-        file: path of the file; in a set, `places` has its name.
+        file: path of the file, for messages.
         head: the header by the tags of the pages.
         text: the description of the first page.
-        places: places of the pages in a set of files, see `places_in_set`.
+        own: places of the pages in a set of files; none of a file alone.
 
     Raises:
         Refused: another type of pixels than it states, or more bits than they have.
@@ -264,7 +271,7 @@ def of_file(
                 _add(stated, f"{name} {key}", page, " or ".join(found), head.pages)
     planes = _planes(text)
     pages = [(sum(place[1:]), place) for place in planes]  # one of C, Z and T runs
-    for page, place in enumerate(places[file.name]) if places else pages:
+    for page, place in enumerate(own) if own else pages:
         for plane in planes.get(place, ()):
             if "ExposureTime" in plane and page < head.pages:
                 unit = plane.get("ExposureTimeUnit", "s")

@@ -6,7 +6,7 @@ For TIFF see `mvrecon.data.projections.tiff`, for PNG `png`, for RTK's formats `
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from itertools import groupby, islice
 from pathlib import Path
@@ -18,6 +18,7 @@ from mvrecon.core.files.keys import Key
 from mvrecon.data.dicom_image import DICOM, ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures, rtk_images
+from mvrecon.data.projections.descriptions import path_in_set
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.png import png_header, png_pages
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet, ProjectionStack
@@ -151,7 +152,7 @@ class ImageFiles(ProjectionStack):
                     )
         where = files[0] if len(files) == 1 else files[0].parent
         pages = [(f, k) for f, head in zip(files, headers, strict=True) for k in range(head.pages)]
-        order = _order_of(where, headers[0].places, pages)
+        order = _order_of(where, [place for head in headers for place in head.own], len(pages))
         self.stated = {}
         for name in dict.fromkeys((*COMPARED, *(key for head in headers for key in head.stated))):
             own = [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
@@ -197,13 +198,10 @@ class ImageFiles(ProjectionStack):
         return np.stack(found)
 
 
-def _order_of(
-    where: Path, places: Mapping[str, Sequence[PlaceInSet]], pages: Sequence[tuple[Path, int]]
-) -> list[int]:
+def _order_of(where: Path, own: Sequence[PlaceInSet], pages: int) -> list[int]:
     """The numbers of pages in the order of their places in a set; without a set, as they are."""
-    if not places:
-        return [*range(len(pages))]
-    own = [places[file.name][page] for file, page in pages]
+    if not own:
+        return [*range(pages)]
     counts = [len({*column}) for column in zip(*own, strict=True)]
     names = zip(("images", "C", "Z", "T"), counts, strict=True)
     axes = [f"{count} along {name}" for name, count in names if count > 1]
@@ -344,12 +342,13 @@ def _of_set(files: Sequence[Path], gaps: bool, chosen: bool) -> list[Path]:
     places = header(files[0]).places if _ending(files[0]) == "TIFF" else {}
     if not places:
         return []
-    names = {file.name for file in files}
+    paths = [path_in_set(file, places) or file.name for file in files]
+    names = {*paths}
     if absent := sorted(places.keys() - names if not (gaps or chosen) else []):
         raise Refused(
-            f"{files[0].parent}: expected the {len(places)} files of the set that OME describes in "
-            f"{files[0].name}, got {len(names)} without {shown(absent)}; where views were left out "
-            f"on purpose: gaps=true, or pattern=... (views.pattern)"
+            f"{files[0].parent}: expected in it the {len(places)} files of the set that OME "
+            f"describes in {files[0].name}, got {len(names)} without {shown(absent)}; where views "
+            f"were left out on purpose: gaps=true, or pattern=... (views.pattern)"
         )
     if others := sorted(names - places.keys()):
         raise Refused(
@@ -358,7 +357,7 @@ def _of_set(files: Sequence[Path], gaps: bool, chosen: bool) -> list[Path]:
             f"a file that was renamed needs its name back"
         )
     if not gaps:
-        numbers = [place for file in files for place in places[file.name]]
+        numbers = [place for path in paths for place in places[path]]
         check_steps(files[0].parent, [[*map(Decimal, place)] for place in numbers])
     return [*files]
 

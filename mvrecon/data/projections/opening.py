@@ -261,7 +261,8 @@ def _field_at(
     views: ProjectionStack, name: str, value: str, layout: Layout | None
 ) -> ProjectionStack:
     """A field's images by their name in the scan's HDF5 file, or by their own path."""
-    if views.scan and (place := _place_in(views, value)):
+    folder = Path(value).expanduser().is_dir()
+    if views.scan and not folder and (place := _place_in(views, value)):
         frames = Frames(place, views.scan.parent.resolve())
         stack: ProjectionStack = FrameViews(frames, np.arange(frames.shape[0]))
     else:
@@ -276,7 +277,7 @@ def _field_at(
 
 def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:
     """The data set of a name in the scan's HDF5 file; None if there is none, or a file of it."""
-    if views.scan is None or Path(name).expanduser().exists():
+    if views.scan is None or Path(name).expanduser().is_file():
         return None
     if (place := followed(views.scan, str(name), EXPECTED)) is None:
         return None

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from mvrecon.core.quantities import InsideOrFile
+from mvrecon.core.quantities import InsideOrFile, InsideOrPath
 from mvrecon.data.projections.exposures import EXPOSURE_WORDS
 from mvrecon.data.projections.opening import Layout
 from mvrecon.data.projections.rings import Rings
@@ -83,8 +83,8 @@ class Measured:
 
     path: str | Path
     kind: Kind | None = None
-    dark: float | InsideOrFile | None = None
-    flat: float | InsideOrFile | None = None
+    dark: float | InsideOrPath | None = None
+    flat: float | InsideOrPath | None = None
     exposure: Annotated[InsideOrFile, EXPOSURE_WORDS] | None = None
     floor: float = 1e-4
     dead: float = 0.05

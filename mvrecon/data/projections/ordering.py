@@ -85,10 +85,15 @@ def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> l
                 f"{where}: expected one file of every number, got {shown(first.name)} and "
                 f"{shown(second.name)}"
             )
+    sequence, _, values = _sorted(paths, exponents + INTEGER)
+    whole = [values[path][1::2] for path in files]
+    if sequence == files and all(map(_by_one, zip(*whole, strict=False))):  # 1.1 to 1.9, 2.1 to 2.9
+        readings.append(whole)
+    _check_counters(where, files, rows)
     if all(map(_missing, readings)):
         if not gaps:
             check_steps(where, rows)
-        if _sorted(paths, exponents + INTEGER)[0] != files:  # and no steps decide between them
+        if sequence != files:  # and no steps decide between them
             warnings.warn(
                 f"{where}: the numbers in the names of the views are taken for decimals: "
                 f"{', '.join(path.name for path in files[:4])}, ...",
@@ -163,6 +168,26 @@ def _counted(pattern: str, stems: Sequence[str]) -> bool:
     places = [re.split("[.,]", text)[1] for stem in stems for text in re.findall(pattern, stem)]
     ends = any(len(part) > 1 and part.endswith("0") for part in places)
     return ends and len({*map(len, places)}) > 1
+
+
+def _by_one(column: Sequence[Any]) -> bool:
+    """Whether a number of the names takes all values from its least to its greatest."""
+    return max(column) - min(column) < len({*column})
+
+
+def _check_counters(where: Path, files: Sequence[Path], numbers: Sequence[Sequence[Any]]) -> None:
+    """Warn of files that a later number counts in another order, as in angle_index; the first one
+    of index_angle is a counter itself.
+    """
+    columns = [column for column in zip(*numbers, strict=True) if len({*column}) > 1]
+    counters = [c for c in columns if len({*c}) == len(c) and _by_one(c)]
+    if any([*c] != sorted(c) for c in counters) and columns[0] not in counters:
+        warnings.warn(
+            f"{where}: the views are in the order of the first number in their names, in which a "
+            f"later one does not run: {', '.join(path.name for path in files[:4])}, ...; where "
+            f"that one counts the views, remove the first from the names",
+            stacklevel=3,
+        )
 
 
 def check_steps(where: Path, numbers: Sequence[Sequence[Any]]) -> None:

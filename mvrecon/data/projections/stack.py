@@ -50,7 +50,8 @@ class Header(NamedTuple):
         stated: attributes on which grey values or places depend, by name a text for each page.
         linear: whether values are stated to be in proportion to intensity.
         excluded: where negative values mark bad pixels, the number of these that the file states.
-        places: for a set of files, the places of the pages of each, by the file's name.
+        places: for a set of files, the places of the pages of each, by the file's path.
+        own: those of the pages of this file.
     """
 
     shape: tuple[int, int]
@@ -63,6 +64,7 @@ class Header(NamedTuple):
     linear: bool = False
     excluded: int | None = None
     places: Mapping[str, Sequence[PlaceInSet]] = {}
+    own: Sequence[PlaceInSet] = ()
 
     @property
     def words(self) -> str:

@@ -129,12 +129,13 @@ def tiff_header(file: Path) -> Header:
             )
         text = _description(file, descriptions.without_own_id(pages[0].description))
         places = descriptions.places_in_set(text)
-        _check_order(file, text, numbers, images, places)
+        own = places.get(descriptions.path_in_set(file, places) or "", ())
+        _check_order(file, text, numbers, images, places, own)
         stated *= images // len(pages)
         names = dict.fromkeys(name for one in stated for name in one)
         texts = {name: [one.get(name, "") for one in stated] for name in names}
         head = first._replace(stated=texts)
-        first = descriptions.of_file(file, head, text, places)._replace(places=places)
+        first = descriptions.of_file(file, head, text, own)._replace(places=places, own=own)
     if _offset(pages[0]):
         return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return first
@@ -200,6 +201,7 @@ def _check_order(
     numbers: Sequence[tuple[int, ...] | None],
     images: int,
     places: Mapping[str, Sequence[PlaceInSet]],
+    own: Sequence[PlaceInSet],
 ) -> None:
     """Raise for pages that are not in the order of one axis, by the description of the first and
     the PageNumbers of all; for a file of a set, if its pages are not those with places in it.
@@ -208,12 +210,12 @@ def _check_order(
     if known != sorted(known):
         raise Refused(f"{file}: expected pages in the order of PageNumber, got {shown(known)}")
     if places:
-        if len(own := places.get(file.name, ())) != images:
+        if len(own) != images:
             raise Refused(
                 f"{file}: expected a place of each of its {images} images in the set of "
                 f"{len(places)} files that its ImageDescription names ({min(places)}, ...), got "
-                f"{len(own)}; was it renamed, or cut? Where its name has the right order, save it "
-                f"without that description"
+                f"{len(own)}; was it renamed, moved or cut? Where its name has the right order, "
+                f"save it without that description"
             )
         return
     if not ("ImageJ" in text or descriptions.OME.search(text)):

@@ -102,7 +102,7 @@ def test_subsets_need_not_divide_the_cameras(operator):
 
 
 def test_a_map_outside_the_grid_is_refused(tmp_path: Path):
-    """An attenuation map with all of its matter beside the grid is refused."""
+    """An attenuation map with all of its matter outside the grid is refused."""
     path = tmp_path / "mu.nii.gz"
     save_volume(path, torch.full(ELSEWHERE.shape, 0.015), ELSEWHERE)
     with pytest.raises(ValueError, match=r"about \(0, 0, 0\) mm, .* got all of it elsewhere"):

@@ -110,6 +110,12 @@ def test_dead_time_is_undone(tmp_path, settings, paralysable, rows):
         assert level(tmp_path / "run") == pytest.approx(LEVEL, rel=0.01)
 
 
+def test_no_dead_time_changes_nothing_whatever_it_would_need(tmp_path, settings):
+    """As in a sweep of dead times that begins at 0."""
+    factors = "factors={name: detector, dead_time_us: 0, in_window: 0.8, paralysable: true}"
+    assert (read_scan(settings(torch.ones(16), factors)).factors == 1).all()
+
+
 @pytest.mark.parametrize("binning", [1, 2])
 def test_a_flood_with_a_gradient_is_undone(tmp_path, settings, binning):
     """A sensitivity from 0.5 to 1.5 across the detector, and a dead pixel with counts of noise."""

@@ -157,8 +157,34 @@ def test_an_unknown_start_of_a_frame_is_asked_for(tmp_path: Path):
     turn.ActualFrameDuration = -1
     with pytest.raises(Refused, match="ActualFrameDuration is not negative"):
         open_projections(study(tmp_path / "c.dcm", RotationInformationSequence=[turn]))
-    with pytest.raises(Refused, match="a positive ActualFrameDuration"):
-        open_projections(in_phases(tmp_path / "d.dcm", 10, 0), dataset="frame1")
+
+
+def test_what_a_phase_does_not_state_is_unknown_or_none(tmp_path: Path):
+    """A duration of 0 ms as well as an absent one: its own frames and the starts of later ones are
+    unknown, those before are not. Where no phase states one, the rotation does; a pause or delay
+    that is absent is none, and a number of frames that of the vectors. Also tried: the first phase
+    of 0 ms, empty values, a file of one frame in time.
+    """
+    path = in_phases(tmp_path / "a.dcm", 10, 0)
+    for name, duration, starts in (("frame4", 10.0, [30.0] * 2), ("frame6", None, None)):
+        stack = open_projections(path, dataset=name)
+        assert stack.duration_s == duration and stack.starts_s == starts
+    with pytest.raises(
+        Refused, match=r"frame4 \(from 30 s for 10 s\), frame5 \(from 40 s\), frame6"
+    ):
+        open_projections(path)
+    frames, studies = zip(*read_frames(in_phases(tmp_path / "b.dcm", 0, 0)), strict=True)
+    assert [frame[4:] for frame in frames] == [(0.0, None)] + [(None, None)] * 5
+    assert {view.duration_s for one in studies for view in one.views} == {20.0}
+    bare = [item(pydicom.Dataset, ActualFrameDuration=1000 * duration) for duration in (10, 60)]
+    times = ("PhaseVector", "TimeSliceVector")
+    path = in_time(tmp_path / "c.dcm", times, PhaseInformationSequence=bare)
+    assert [frame.start_s for frame, _ in read_frames(path)] == [0, 10, 20, 30, 40, 100]
+    still = [item(pydicom.Dataset, ActualFrameDuration=0, NumberOfFramesInPhase=1)]
+    stack = open_projections(
+        study(tmp_path / "d.dcm", PhaseInformationSequence=still), dataset="window1"
+    )
+    assert stack.duration_s == 20.0 and stack.starts_s == [0.0, 20.0, 40.0] * 2
 
 
 def test_counts_without_their_photons_are_not_joined(tmp_path: Path):

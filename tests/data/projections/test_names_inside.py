@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.scan_file import NAME, expanded, save
@@ -53,9 +54,9 @@ def told(folder, views):
 
 
 def options_in(folder):
-    """The options of views that the scan.yaml of a folder stands for."""
-    words = dict(word.split("=", 1) for word in expanded([f"scan={folder}"]))
-    return {key.removeprefix("views."): text for key, text in words.items()}
+    """The options of views that the scan.yaml of a folder stands for, as Hydra reads them."""
+    words = OverridesParser.create().parse_overrides(expanded([f"scan={folder}"]))
+    return {word.key_or_group.removeprefix("views."): word.value() for word in words}
 
 
 @pytest.mark.parametrize("way", [typed, told])
@@ -89,6 +90,40 @@ def test_a_file_comes_before_a_data_set_of_its_name(way, scan):
         assert (dark == value).all()
 
 
+def python(folder, views):
+    """The views of options in Python, in a folder."""
+    with chdir(folder):
+        return MeasuredViews(Measured(**{**views, "path": folder / views["path"]}))
+
+
+@pytest.mark.parametrize("way", [typed, told, python])
+def test_a_folder_of_the_name_of_a_data_set_is_none_of_what_needs_a_file(way, scan):
+    """Whatever is in it; a folder of a field's name is its images. Also tried: a description beside
+    such folders that is written elsewhere, links to folders.
+    """
+    for name in ("raw/all", "raw/keys", "turn", "light", "none"):
+        (scan.parent / name).mkdir(parents=True)
+        images(scan.parent / name, grey())
+    views = way(scan.parent, {"path": "scan.h5", **KEYED, "exposure": "light"})
+    expected = integrals() + np.log(EXPOSURES)[:, None, None]
+    assert torch.allclose(views.whole().views, torch.from_numpy(expected).float(), atol=2e-6)
+    assert np.allclose(views.stack.rig["angles"], ANGLES)
+    with pytest.raises(Refused, match="has no data set none, nor is there a file none"):
+        typed(scan.parent, {"path": "scan.h5", **KEYED, "angles": "none"})
+
+
+@pytest.mark.parametrize("way", [typed, told])
+@pytest.mark.parametrize("name", ["1e1", "null", "2020", "true", "007", "1.5"])
+def test_data_sets_may_be_called_as_numbers_are(name, way, scan):
+    with h5py.File(scan, "a") as file:
+        file[name], file[f"of/{name}"] = ANGLES, KEYS
+    views = way(
+        scan.parent,
+        {"path": "scan.h5", "dataset": "raw/all", "angles": name, "image_key": f"of/{name}"},
+    )
+    assert np.allclose(views.stack.rig["angles"], ANGLES)
+
+
 @pytest.mark.parametrize("path", ["scan.h5", "scan.h5:/raw/frames"])
 def test_files_where_a_command_runs_are_not_those_of_a_scan(path, scan, monkeypatch):
     """A scan.yaml means the same in every folder, also in one with files of its names, and where a
@@ -105,8 +140,7 @@ def test_files_where_a_command_runs_are_not_those_of_a_scan(path, scan, monkeypa
     scan.with_name(NAME).write_text(yaml.safe_dump({"views": options}))
     monkeypatch.chdir(here)
     for folder in (scan.parent, here / "copy"):
-        words = dict(word.split("=", 1) for word in expanded([f"scan={folder}"]))
-        settings = {key.removeprefix("views."): text for key, text in words.items()}
+        settings = options_in(folder)
         views = typed(here, settings)
         expected = integrals() + np.log(EXPOSURES)[:, None, None]
         assert torch.allclose(views.whole().views, torch.from_numpy(expected).float(), atol=2e-6)

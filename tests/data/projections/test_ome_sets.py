@@ -55,10 +55,12 @@ def described(pages, axis="T", binary=None, sizes=None):
     return f'<OME xmlns="x" UUID="urn:uuid:7">{whole}</OME>'
 
 
-def stored(folder, names, axis="T", binary=None, sizes=None):
-    """A set with the views of `grey` in files of these names, pages of one name in a row."""
+def stored(folder, names, axis="T", binary=None, sizes=None, start=""):
+    """A set with the views of `grey` in files of these names, pages of one name in a row; the
+    description has `start` before each.
+    """
     folder.mkdir()
-    pages = [(name, names[:k].count(name)) for k, name in enumerate(names)]
+    pages = [(start + name, names[:k].count(name)) for k, name in enumerate(names)]
     for name in dict.fromkeys(names):
         values = grey()[[k for k, other in enumerate(names) if other == name]]
         text = described(pages, axis, binary if binary != name else None, sizes)
@@ -79,6 +81,10 @@ SETS = {
     "described in one": (ONE_EACH, {"binary": ONE_EACH[4]}),
     "split": (["a.ome.tif"] * 7 + ["a_1.ome.tif"] * 5, {}),
     "split and alternating": (["a.ome.tif", "b.ome.tif"] * 6, {}),
+    "of this folder": (ONE_EACH, {"start": "./"}),
+    "of a folder": (ONE_EACH, {"start": "scan/"}),
+    "of a folder of Windows": (ONE_EACH, {"start": "scan\\"}),
+    "of a path that is not the shortest": (ONE_EACH, {"start": "scan/../scan//"}),
 }
 
 
@@ -195,7 +201,7 @@ def with_two_pages(folder):
 
 REFUSED = {
     renamed: r"files of the set that OME describes in .*|a place of each of its 1 images",
-    without_one: r"expected the 12 files .* got 11 without \['a_.*gaps=true",
+    without_one: r"expected in it the 12 files .* got 11 without \['a_.*gaps=true",
     with_another: r"got \['b_1.tif'\] as well; choose by pattern",
     of_two_sets: r"got \['b_0.ome.tif', 'b_1.ome.tif'\] as well; choose by pattern",
     of_another_description: "expected files of one set .* got another; choose by pattern",
@@ -209,6 +215,18 @@ def test_other_files_than_those_of_a_set_are_refused_with_a_cure(change, tmp_pat
     change(folder)
     with pytest.raises(Refused, match=REFUSED[change]):
         open_projections(folder)
+
+
+@pytest.mark.parametrize("start", ["../", "/data/scan/", "C:\\scan\\", "scan/../../", "other/"])
+def test_files_of_other_folders_are_no_set(start, tmp_path):
+    """Also tried: some of them, in the folder itself or below."""
+    folder = stored(tmp_path / "scan", ONE_EACH, start=start)
+    with pytest.raises(Refused, match="a place of each of its 1 images .* got 0; .* moved"):
+        open_projections(folder)
+    pages = [(name, 0) for name in ("a.tif", f"{start}b.tif")]
+    written(tmp_path / "a.tif", grey()[0], description=described(pages).encode())
+    with pytest.raises(Refused, match=r"expected in it the 2 files .* without \['.*b.tif'\]"):
+        open_projections(tmp_path)
 
 
 def test_views_left_out_of_a_set_on_purpose(tmp_path):

@@ -191,15 +191,42 @@ def test_decimals_in_names_decide_the_order(tmp_path):
         ["1.2.9", "1.2.10", "1.2.11"],
         ["p_.25", "p_.5", "p_.75"],
         ["p_8.5", "p_9.5", "p_10.5"],
+        [f"{row}.{k}" for row in (1, 2, 3) for k in range(1, 10)],  # a table: no 2.0 is missing
+        [f"a{row}.{k} b" for row in (0, 1) for k in range(3)],
+        [f"{row}.{k:02}" for row in (9, 10) for k in range(1, 12)],
     ):
         paths = [tmp_path / f"{name}.tif" for name in names]
         assert ordered(paths[::-1]) == paths
 
 
 @pytest.mark.parametrize(
+    ("name", "warned"),
+    [
+        ("s_{angle:03}_{k:04}", True),
+        ("s1_{angle}_{k}", True),
+        ("{energy}_{k:04}", True),
+        ("s_{k:04}_{angle:03}", False),
+        ("s_{k:04}_{energy}", False),
+        ("s_{ms}_{k}", False),
+    ],
+)
+def test_a_counter_in_another_order_than_the_first_number_is_named(name, warned, tmp_path):
+    """As of angles beyond a turn before the number of the view. Also tried: turns, random names."""
+    names = [name.format(k=k, angle=25 * k % 360, energy=1 + k % 2, ms=41 * k) for k in range(24)]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ordered([tmp_path / f"{name}.tif" for name in names])
+    assert ["a later one does not run" in str(one.message) for one in caught] == [True] * warned
+
+
+@pytest.mark.parametrize(
     "names",
     [
         ["p_0.0", "p_0.25", "p_0.75"],
+        ["p_0.00", "p_0.25", "p_1.00", "p_1.25"],
+        ["p_0.5", "p_1.0", "p_2.0", "p_2.5"],
+        [f"{row}.{k}" for row in (1, 2) for k in range(1, 10)][:-1],
+        [f"{row}.{k}" for row in (1, 3) for k in range(1, 10)],
         ["p_0.1", "p_0.2", "p_0.4"],
         ["p1.8", "p1.9", "p1.11"],
         ["a1_1", "a1_2", "a1_3", "a2_1", "a2_3"],

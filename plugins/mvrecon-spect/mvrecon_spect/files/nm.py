@@ -78,7 +78,7 @@ KEYS = (
         "ActualFrameDuration",
         "applied",
         "of the phase, else of the rotation, else of the image; these must have one in common; "
-        "unknown of gated frames",
+        "unknown of gated frames; 0: not stated",
     ),
     Key("FrameTime", "applied", "of the one item of GatedInformationSequence"),
     *(Key(name, "applied") for name in ("PhaseDelay", "PauseBetweenFrames")),
@@ -221,7 +221,7 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
         energies = tuple(_window(dataset, index) for index in windows)
         frames = [_frame(dataset, moment, moments) for moment in moments]
         start = began(image.dataset)
-    phases = bool(dataset["PhaseInformationSequence"])
+    phases = any(_seconds(item) for item in dataset["PhaseInformationSequence"] or ())
     gated = dataset["GatedInformationSequence"] or len({moment[2:] for moment in moments}) > 1
 
     def study(frame: Frame) -> NmStudy:
@@ -458,21 +458,25 @@ def _view(dataset: Any, key: tuple[int, int, int], views: Sequence[tuple[int, in
 
 def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
     """Start and duration of a frame, from the preceding phases of dynamic studies or the nominal
-    slot time of gated ones; PS3.3, C.8.4.11 and C.8.4.14.
+    slot time of gated ones; PS3.3, C.8.4.11 and C.8.4.14. Programs leave out a pause or delay of 0.
     """
     phase, piece, interval, slot = moment
     if dataset.get("PhaseInformationSequence"):
-        start = 0.0
+        start: float | None = 0.0
         for number in range(1, phase + 1):
             item = _item(dataset, "PhaseInformationSequence", number)
-            duration, pause = _seconds(item), float(item.PauseBetweenFrames or 0) / 1000
-            if duration is None:
-                raise ValueError("a phase needs a positive ActualFrameDuration")
-            pieces, stated = {p for n, p, *_ in moments if n == number}, item.NumberOfFramesInPhase
-            if len(pieces) > int(stated):
-                raise ValueError(f"NumberOfFramesInPhase is {stated}, got {len(pieces)} slices")
-            before = piece - min(pieces) if number == phase else int(stated)
-            start += float(item.PhaseDelay or 0) / 1000 + before * (duration + pause)
+            delay, pause, count = (
+                _number(name, item, 0, 1) or 0.0
+                for name in ("PhaseDelay", "PauseBetweenFrames", "NumberOfFramesInPhase")
+            )
+            pieces, duration = {p for n, p, *_ in moments if n == number}, _seconds(item)
+            if 0 < count < len(pieces):
+                raise ValueError(f"NumberOfFramesInPhase is {count:g}, got {len(pieces)} slices")
+            before = piece - min(pieces) if number == phase else count or len(pieces)
+            if start is None or (duration is None and before):
+                start = None
+            else:
+                start += (delay + before * pause) / 1000 + before * (duration or 0.0)
         return Frame(*moment, start, duration)  # pyrefly: ignore[unbound-name]
     gate = _item(dataset, "GatedInformationSequence", 1)
     step = _number("FrameTime", _item(gate, "DataInformationSequence", interval), 0, 1)

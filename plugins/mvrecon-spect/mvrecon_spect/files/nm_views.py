@@ -131,7 +131,8 @@ def _energies(window: EnergyWindow) -> str:
 
 
 def _time(frame: Frame) -> str:
-    return "" if frame.start_s is None else f"from {frame.start_s:g} s for {frame.duration_s:g} s"
+    known = {"from": frame.start_s, "for": frame.duration_s}
+    return " ".join(f"{word} {time:g} s" for word, time in known.items() if time is not None)
 
 
 def _duration(path: Path, views: Sequence[View]) -> float | None:

@@ -37,7 +37,7 @@ def detector(
     half_life_s: PositiveFloat | None = None,
     start_s: float | Sequence[float] | str | Path | None = None,
     reference_s: float = 0.0,
-    dead_time_us: NonNegativeFloat = 0.0,
+    dead_time_us: NonNegativeFloat | None = None,
     paralysable: bool = False,
     in_window: PositiveFloat | None = None,
     time_s: PositiveFloat | None = None,
@@ -56,7 +56,7 @@ def detector(
         start_s: start of every view in s; one number for views that start together, or a text file
             of numbers. None: as in the file.
         reference_s: time in s, on the clock of `start_s`, of the activity that is reconstructed.
-        dead_time_us: dead time in microseconds, see `live_factors`.
+        dead_time_us: dead time in microseconds, see `live_factors`; 0 or None: none.
         paralysable: use the paralysable model.
         in_window: share of the registered events that are in the energy window of the views, for
             their rate; required with a dead time.
@@ -76,7 +76,7 @@ def detector(
         ("in_window", in_window, "dead_time_us", dead_time_us),
         ("paralysable", paralysable, "dead_time_us", dead_time_us),
     ):
-        if value and not needed:
+        if value and needed is None:
             raise Refused(
                 f"{where}: expected factors.{other} with {option}={value}, which has no effect "
                 f"without it, got none"
