@@ -145,17 +145,6 @@ def test_a_word_that_sets_nothing_is_answered_by_an_example(app: str, words: lis
     assert WORDS[app] in text and f"got {words[-1]!r}; --help" in text and text.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", ["mvrecon-list", "my_script"])
-def test_ctrl_c_while_a_command_is_imported_is_one_line(name: str, tmp_path: Path):
-    script = tmp_path / name
-    script.write_text("import mvrecon.apps\nraise KeyboardInterrupt")
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
-    assert done.returncode in (-2, 130)  # 130 in a shell
-    is_command = name.startswith("mvrecon-")
-    assert (done.stderr == f"{name}: stopped by Ctrl-C\n") == is_command
-    assert ("Traceback" in done.stderr) != is_command
-
-
 def test_an_experiment_of_another_app_is_reported_as_such(answer):
     """Hydra alone would propose to override a part of the experiment."""
     text = answer("experiment=smoke", app="simulate")
