@@ -93,7 +93,7 @@ def test_an_option_that_an_experiment_sets_for_another_method_has_a_remedy(answe
 def test_warnings_that_differ_in_numbers_alone_are_one_line_and_counted(
     capsys: pytest.CaptureFixture[str],
 ):
-    """As those of each step of a training are; other texts and other names are lines of their own."""
+    """As those of training steps; other texts and other names are lines of their own."""
     with one_line("mvrecon-train"):
         for number in range(5):
             text = f"In {number} of 8 views {number / 3:.1f}% are cut"
