@@ -54,6 +54,16 @@ def test_simple_itk_reads_our_volume_at_the_same_positions(ending, tmp_path):
     assert torch.allclose(there.affine, grid.affine, atol=1e-5)
 
 
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("name", ["Röntgen", "日本", "a b", "a(1)", "a;b", "a=b", "q'uote"])
+def test_the_values_beside_a_header_of_itk_have_any_name(name, packed, tmp_path):
+    """ITK writes the name of the .raw or .zraw into the .mhd in UTF-8."""
+    values = np.arange(24, dtype="f4").reshape(2, 3, 4)
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / f"{name}.mhd"), packed)
+    got = read_volume(tmp_path / f"{name}.mhd")[0].flip(1, 2)  # LPS
+    assert np.array_equal(got.numpy(), values)
+
+
 @pytest.mark.pairwise(name=AFFINES, ending=["mha", "nrrd", "mhd"])
 def test_an_object_in_an_itk_image_has_its_world_position(name, ending, tmp_path):
     affine = centred(AFFINES[name])
