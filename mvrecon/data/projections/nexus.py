@@ -382,10 +382,10 @@ class _Layout(NamedTuple):
             return np.zeros(count, int)
         if self.sinogram:
             raise Refused(f"{self.key}: expected no keys of sinograms, got some")
-        keys = values_at(self.key, EXPECTED)
-        if keys.shape != (count,):
+        stored = values_at(self.key, EXPECTED)
+        if (keys := stored.ravel()).shape != (count,) or max(stored.shape) < count:
             raise Refused(
-                f"{self.key}: expected a key for each of {count} frames, got {keys.shape}"
+                f"{self.key}: expected a key for each of {count} frames, got {stored.shape}"
             )
         if unknown := sorted({*keys.tolist()} - {VIEW, FLAT, DARK, INVALID, ALIGNMENT}):
             raise Refused(

@@ -126,6 +126,15 @@ LAYOUTS = {
         tomo(folder / "a.nxs", sample__rotation_angle=ANGLES),
         {},
     ),
+    "keys and angles as rows": lambda folder: (
+        tomo(
+            folder / "a.nxs",
+            sample__rotation_angle=angles()[None],
+            instrument__detector__image_key_control=None,
+            instrument__detector__image_key=np.where(KEYS == -1, 3, KEYS)[None].astype("f8"),
+        ),
+        {},
+    ),
     "radians": lambda folder: (
         tomo(folder / "a.nxs", unit=b"rad", sample__rotation_angle=np.radians(ANGLES)),
         {},
