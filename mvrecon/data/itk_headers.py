@@ -57,6 +57,7 @@ META_KEYS = (
     ),
     Key("ElementMin, ElementMax, Modality, SequenceID", "ignored", "statistics and origin"),
     Key("ObjectSubType, TransformType", "ignored", "of other objects than images"),
+    Key("toffset", "ignored", "NIfTI's time, which ITK copies with other keys of its header"),
 )
 #: Numbers of a key of MetaImage, as a power of the number of axes.
 COUNTS = {
