@@ -55,7 +55,7 @@ def test_simple_itk_reads_our_volume_at_the_same_positions(ending, tmp_path):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("name", ["Röntgen", "日本", "a b", "a(1)", "a;b", "a=b", "q'uote"])
+@pytest.mark.parametrize("name", ["Röntgen", "日本", "a b", "a(1)", "a;b", "a=b", "12:30"])
 def test_the_values_beside_a_header_of_itk_have_any_name(name, packed, tmp_path):
     """ITK writes the name of the .raw or .zraw into the .mhd in UTF-8."""
     values = np.arange(24, dtype="f4").reshape(2, 3, 4)

@@ -216,7 +216,8 @@ def file_beside(header: Path, stated: str) -> Path:
     if Path(stated).is_absolute() and Path(stated).parent.resolve() == folder.resolve():
         stated = Path(stated).name
     for part in stated.removeprefix("./").split("/"):
-        if not _plain(part) or (path := path / part).is_symlink():
+        above, path = path, path / part  # a colon is a time on Linux, and a drive on Windows
+        if not _plain(part.replace(":", "")) or path.parent != above or path.is_symlink():
             raise Refused(
                 f"{header}: expected a file of values in its folder or below, not through a link, "
                 f"got {shown(stated)}"
