@@ -533,6 +533,16 @@ def test_the_kind_of_a_scale_of_a_plot_is_no_scale(name, tmp_path):
         opened(area(path, name, scale_factor=[1.0, 2.0]))
 
 
+def test_a_flat_field_of_another_name_is_listed_and_read(tmp_path):
+    """As the SLS names those before and behind the views."""
+    flat = np.full((2, ROWS, COLUMNS), FLAT, "u2")
+    path = exchange(tmp_path / "a.h5", data_white=None, data_white_pre=flat, data_white_post=flat)
+    with pytest.raises(Refused, match="no flat field, it contains .*/exchange/data_white_pre"):
+        opened(path)
+    views = opened(path, flat="exchange/data_white_pre").whole().views
+    assert np.allclose(views, integrals(), atol=1e-6)
+
+
 CHANGED = {
     "flats of half the exposure": (
         {"instrument__detector__count_time": np.where(KEYS == 1, 0.05, 0.1)},
