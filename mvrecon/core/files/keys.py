@@ -37,7 +37,7 @@ class Key(NamedTuple):
 #: Words of unknown keys that change values, units or the order of values, and the value of such a
 #: key that does not.
 EFFECTS = {
-    "scal(e|ing)(?!_?types?)|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
+    "scal(e|ing)(?!_?(types?|bar))|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
     "offset|intercept|bias|skip": 0,
     "fill|missing|valid|nodata": math.nan,
     "unit|calibrat|quanti|unsigned|endian|mirror|flip|transpos|logarithm|"
