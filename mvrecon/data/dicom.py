@@ -269,10 +269,11 @@ def _slices(path: Path) -> list[Slice]:
             f"{path}: expected Hounsfield units by Units and MeasurementUnitsCodeSequence, got "
             f"{', '.join(sorted(other))}"
         )
+    mapped = image.stated("RealWorldValueMappingSequence")
     for name in ("RescaleSlope", "RescaleIntercept"):
         for value in image.values(name):
             with file_errors(path, f"has a {name} that cannot be read"):
-                if value is None or not np.isfinite(float(value)):
+                if not mapped if value is None else not np.isfinite(float(value)):
                     raise Refused(f"{path}: expected a finite {name} of a CT slice, got {value}")
     if not (series := image.value("SeriesInstanceUID")):
         raise Refused(f"{path}: expected a slice with SeriesInstanceUID, got none")

@@ -13,7 +13,7 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, decoded
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.grid import Grid
 
@@ -108,7 +108,7 @@ def _stated_in(path: Path) -> list[Path]:
     """The other files that the lines of text in a file state, by their paths from its folder."""
     with open(path, "rb") as file:
         head = file.read(HEADER)
-    values = STATED.findall(head.decode("utf-8", "surrogateescape"))
+    values = STATED.findall(decoded(head))
     places = [path.parent / value for value in dict.fromkeys(values)]
     return [place for place in places if os.path.isfile(place) and place != path]
 

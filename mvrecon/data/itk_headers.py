@@ -57,6 +57,7 @@ META_KEYS = (
     ),
     Key("ElementMin, ElementMax, Modality, SequenceID", "ignored", "statistics and origin"),
     Key("ObjectSubType, TransformType", "ignored", "of other objects than images"),
+    Key("toffset", "ignored", "NIfTI's time, which ITK copies with other keys of its header"),
 )
 #: Numbers of a key of MetaImage, as a power of the number of axes.
 COUNTS = {
@@ -177,7 +178,7 @@ def meta_header(path: Path, text: str) -> Header:
             f"{path}: expected LOCAL or one file as ElementDataFile, got {checks.shown(name)}; "
             f"join its files"
         )
-    data = path if local else checks.file_beside(path, name)
+    data = path if local else checks.file_beside(path, checks.decoded(name.encode("latin-1")))
     skipped, packed = int(numbers.get("HeaderSize", [0])[0]), flags.get("CompressedData", False)
     if skipped < (0 if packed else -1) or (skipped > 0 and local):
         raise checks.Refused(

@@ -187,6 +187,8 @@ def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Da
 
 #: Fields beside a data set by which NeXus scales it, with its name before them or alone (NXdata).
 NEXUS_SCALES = ("scaling_factor", "offset")
+#: Most numbers of an attribute that is compared with one that changes nothing.
+MAX_NUMBERS = 16
 
 
 def check_attributes(
@@ -226,9 +228,11 @@ def _check_effect(path: Path, holder: Any, name: str, kind: Any, what: str) -> N
     """Raise for an attribute of a holder, or a field in it, that would change values."""
     value = type(kind).__name__  # of a link, which is not followed
     if hasattr(kind, "dtype"):
-        plain = kind.dtype.kind in "iuf" and kind.shape in ((), (1,))
+        few = kind.shape is not None and 0 < math.prod(kind.shape) <= MAX_NUMBERS
         own = holder.attrs if isinstance(kind, h5py.h5a.AttrID) else holder
-        value = np.ravel(own[name])[0].item() if plain else str(kind.dtype)
+        numbers = np.ravel(own[name]).tolist() if few and kind.dtype.kind in "iuf" else []
+        one = len({*map(str, numbers)}) == 1  # one of each axis, as [0 0]
+        value = numbers[0] if one else numbers or str(kind.dtype)
     if has_effect(name, value):
         raise Refused(
             f"{path}: expected no {what}, which the reader does not apply, got {value}; apply it, "

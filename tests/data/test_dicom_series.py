@@ -18,6 +18,7 @@ from tests.data.projections.conftest import dicom_image
 COUNT, ROWS, COLUMNS = 7, 5, 6
 SPACING = (2.0, 1.5, 3.0)  # columns, rows, slices
 SERIES = pydicom.uid.generate_uid()
+SCALE = ("Slope", "Intercept")
 
 
 def hu():
@@ -333,6 +334,25 @@ def test_frames_that_contradict_the_image_or_each_other_are_refused_by_name(case
     change(image, own, shared)
     image.save_as(file)
     with pytest.raises(Refused, match=message):
+        read_volume(file.parent)
+
+
+def test_real_world_values_take_the_place_of_a_slope(tmp_path):
+    """Of each frame its own, in Hounsfield units. Without either, values are refused."""
+    file = enhanced(tmp_path / "frames", written(tmp_path / "plain")) / "all.dcm"
+    expected, _ = read_volume(file.parent)
+    image = pydicom.dcmread(file)
+    for own in image.PerFrameFunctionalGroupsSequence:
+        (scale,) = own.PixelValueTransformationSequence
+        names = {f"RealWorldValue{end}": float(scale[f"Rescale{end}"].value) for end in SCALE}
+        own.update(group(RealWorldValueMapping=names))
+        del own.PixelValueTransformationSequence
+    image.save_as(file)
+    assert torch.equal(read_volume(file.parent)[0], expected)
+    for own in image.PerFrameFunctionalGroupsSequence:
+        del own.RealWorldValueMappingSequence
+    image.save_as(file)
+    with pytest.raises(Refused, match="expected a finite RescaleSlope"):
         read_volume(file.parent)
 
 

@@ -146,6 +146,7 @@ def test_entries_of_vgstudio_that_change_nothing_are_accepted(tmp_path):
         **{"geometry__center": "2 1.5 1", "geometry__rotate": "1 0 0 0 1 0 0 0 1"},
     }
     neutral |= {"calibration__status": "off", "description__text": "calibrated", "view__scale": 3}
+    neutral |= {"scalebar__visible": "true", "histogram__scale_type": "logarithmic"}
     for text in ("0 -1", "-3 20", "-1e3 1e3", "-3.00001 20"):
         volume, grid = read_volume(vgi(tmp_path, **neutral, **_ranged(text)))
         assert np.array_equal(volume.numpy(), VALUES) and np.allclose(grid.centre, 0)

@@ -54,6 +54,29 @@ def test_simple_itk_reads_our_volume_at_the_same_positions(ending, tmp_path):
     assert torch.allclose(there.affine, grid.affine, atol=1e-5)
 
 
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("name", ["Röntgen", "日本", "a b", "a(1)", "a;b", "a=b", "12:30"])
+def test_the_values_beside_a_header_of_itk_have_any_name(name, packed, tmp_path):
+    """ITK writes the name of the .raw or .zraw into the .mhd in UTF-8."""
+    values = np.arange(24, dtype="f4").reshape(2, 3, 4)
+    sitk.WriteImage(sitk.GetImageFromArray(values), str(tmp_path / f"{name}.mhd"), packed)
+    got = read_volume(tmp_path / f"{name}.mhd")[0].flip(1, 2)  # LPS
+    assert np.array_equal(got.numpy(), values)
+
+
+@pytest.mark.parametrize("ending", ["mha", "mhd", "nrrd", "nii.gz"])
+def test_what_itk_makes_of_a_nifti_has_its_values(ending, tmp_path):
+    """ITK applies slope and intercept, and copies all keys of the header into the new one."""
+    image = nibabel.Nifti1Image(np.arange(24, dtype="i2").reshape(4, 3, 2), np.diag([2, 3, 4, 1]))
+    image.header.set_slope_inter(2.0, -7.0)
+    image.header.set_xyzt_units("mm", "sec")
+    image.header["toffset"], image.header["descrip"] = 3.5, b"scale = 2; offset = 5"
+    image.to_filename(tmp_path / "a.nii")
+    sitk.WriteImage(sitk.ReadImage(str(tmp_path / "a.nii")), str(tmp_path / f"b.{ending}"))
+    (expected, grid), (got, there) = (read_volume(tmp_path / n) for n in ("a.nii", f"b.{ending}"))
+    assert torch.equal(got, expected) and torch.allclose(there.affine, grid.affine)
+
+
 @pytest.mark.pairwise(name=AFFINES, ending=["mha", "nrrd", "mhd"])
 def test_an_object_in_an_itk_image_has_its_world_position(name, ending, tmp_path):
     affine = centred(AFFINES[name])

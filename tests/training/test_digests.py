@@ -103,29 +103,32 @@ def test_a_file_digest_depends_on_its_contents(tmp_path):
         digests.compare({str(path): digests.of_file(path)}, before, "run")
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
 @pytest.mark.parametrize(
     ("header", "line"),
     [
-        ("ct.mhd", "ElementDataFile = values/ct one.raw"),
-        ("nul.mhd", "Comment = a\0b = c\nElementDataFile = values/ct one.raw"),
-        ("ct.vgi", "[file1]\nSize = 2 2 2\nName=values/ct one.raw\r"),
-        ("mu.hv", "!INTERFILE :=\n!name of data file := values/ct one.raw\n!END OF INTERFILE :="),
+        ("ct.mhd", "ElementDataFile = values/ct ä.raw"),
+        ("nul.mhd", "Comment = a\0b = c\nElementDataFile = values/ct ä.raw"),
+        ("ct.vgi", "[file1]\nSize = 2 2 2\nName=values/ct ä.raw\r"),
+        ("mu.hv", "!INTERFILE :=\n!name of data file := values/ct ä.raw\n!END OF INTERFILE :="),
     ],
 )
-def test_the_digest_of_a_header_depends_on_the_values_that_it_states(tmp_path, header, line):
+def test_the_digest_of_a_header_depends_on_the_values_that_it_states(
+    tmp_path, header, line, encoding
+):
     """Of MetaImage, VGStudio and Interfile; not on other files beside it, nor of a file that
     holds its own values, whose bytes may look like lines.
     """
-    path, values = tmp_path / header, tmp_path / "values" / "ct one.raw"
+    path, values = tmp_path / header, tmp_path / "values" / "ct ä.raw"
     values.parent.mkdir()
-    path.write_bytes(line.encode())
+    path.write_bytes(line.encode(encoding))
     values.write_bytes(b"first")
     before = digests.of_file(path)
     (tmp_path / "other.raw").write_bytes(b"new")
     assert digests.of_file(path) == before
     values.write_bytes(b"other")
     assert digests.of_file(path) != before
-    path.write_bytes(b"\0" + line.encode().replace(b"\n", b"\n\0"))
+    path.write_bytes(b"\0" + line.encode(encoding).replace(b"\n", b"\n\0"))
     assert digests.of_file(path) == hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -72,24 +73,32 @@ def millimetres(where: object, unit: str) -> float:
     return mm
 
 
-def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, errors: str = "strict") -> str:
+def decoded(raw: bytes) -> str:
+    """The text of UTF-8 without its byte order mark; bytes that are not UTF-8 are read as Latin-1,
+    as older programs of Windows write them.
+    """
+    text = raw.decode("utf-8-sig", "surrogateescape")
+    return re.sub("[\udc80-\udcff]", lambda byte: chr(ord(byte[0]) - 0xDC00), text)
+
+
+def text_of(path: str | Path, limit: int = MAX_TEXT_BYTES, strict: bool = True) -> str:
     """The UTF-8 text of a file, without the byte order mark that some programs write before it.
 
     Args:
         path: path of the file.
         limit: most bytes.
-        errors: as in `bytes.decode`: "surrogateescape" keeps bytes of older encodings.
+        strict: whether bytes that are not UTF-8 are refused, or else `decoded`.
 
     Raises:
         OSError: it cannot be read.
-        Refused: more bytes than `limit`, or not UTF-8 if `errors` is "strict".
+        Refused: more bytes than `limit`, or not UTF-8 if `strict`.
     """
     with Path(path).open("rb") as file:
         raw = file.read(limit + 1)
     if len(raw) > limit:
         raise Refused(f"{path}: is larger than {limit} bytes, the most that is read of such a file")
     try:
-        return raw.decode("utf-8-sig", errors)
+        return raw.decode("utf-8-sig") if strict else decoded(raw)
     except UnicodeDecodeError as error:
         raise Refused(f"{path}: is not UTF-8 text ({error})") from error
 
@@ -212,7 +221,8 @@ def file_beside(header: Path, stated: str) -> Path:
     if Path(stated).is_absolute() and Path(stated).parent.resolve() == folder.resolve():
         stated = Path(stated).name
     for part in stated.removeprefix("./").split("/"):
-        if not _plain(part) or (path := path / part).is_symlink():
+        above, path = path, path / part  # a colon is a time on Linux, and a drive on Windows
+        if not _plain(part.replace(":", "")) or path.parent != above or path.is_symlink():
             raise Refused(
                 f"{header}: expected a file of values in its folder or below, not through a link, "
                 f"got {shown(stated)}"

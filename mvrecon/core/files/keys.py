@@ -37,7 +37,7 @@ class Key(NamedTuple):
 #: Words of unknown keys that change values, units or the order of values, and the value of such a
 #: key that does not.
 EFFECTS = {
-    "scal(e|ing)|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
+    "scal(e|ing)(?!_?(types?|bar))|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
     "offset|intercept|bias|skip": 0,
     "fill|missing|valid|nodata": math.nan,
     "unit|calibrat|quanti|unsigned|endian|mirror|flip|transpos|logarithm|"
@@ -55,12 +55,10 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
 
 def section_entries(path: str | Path) -> Iterator[tuple[str, str, str]]:
     """The entries of a text of sections, `[section]` and lines `name=value`: section with its
-    brackets and name in lower case, and value; entries before the first section have "". Bytes that
-    are not UTF-8 are read as Latin-1, as older programs of Windows write them.
+    brackets and name in lower case, and value; entries before the first section have "".
     """
-    section, text = "", text_of(path, errors="surrogateescape")
-    text = re.sub("[\udc80-\udcff]", lambda byte: chr(ord(byte[0]) - 0xDC00), text)
-    for line in map(str.strip, text.splitlines()):
+    section = ""
+    for line in map(str.strip, text_of(path, strict=False).splitlines()):
         name, found, value = line.partition("=")
         if line.startswith("["):
             section = name.lower()

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.linked import Place, beside, check_around, followed
+from mvrecon.data.linked import Place, beside, check_around, followed, numbers_at
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 
@@ -20,6 +20,8 @@ EXPECTED = (
     "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
     "mvrecon-simulate, or views.dataset=<name> of other frames"
 )
+#: Attributes of frames by which areaDetector states their part of the detector.
+REGION = ("NDArrayDimOffset", "NDArrayDimBinning", "NDArrayDimReverse")
 #: `H5S_SEL_ALL` of HDF5: a whole data set.
 SELECTS_ALL = 3
 
@@ -54,7 +56,8 @@ class Frames:
                 raise Refused(f"{place}: expected numbers [m v u] of frames, got {got}")
             self.shape = (1,) * (3 - stored.ndim) + stored.shape
             self.dtype = stored.dtype
-            check_attributes(place.path, stored, ("units",))
+            check_attributes(place.path, stored, ("units", *REGION))
+            self.region = {name: numbers_at(place, name, EXPECTED) for name in REGION}
             check_around(place, EXPECTED)
             if not stored.is_virtual:
                 self.parts = [Segment(place, 0, self.shape[0])]
@@ -76,7 +79,7 @@ class Frames:
         if found is not None:
             with opened(found.path, EXPECTED) as file:
                 stored = dataset_in(found.path, file, found.name, EXPECTED)
-                check_attributes(found.path, stored, ("units",))
+                check_attributes(found.path, stored, ("units", *REGION))
                 shape = stored.shape
             check_around(found, EXPECTED)
             start, end = source.vspace.get_select_bounds()
@@ -157,7 +160,7 @@ class FrameViews(ProjectionStack):
         self._frames, self._numbers, self.scan = frames, numbers, scan
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
-        self.fields, self.rig = fields or {}, rig
+        self.fields, self.rig, self.detector = fields or {}, rig, frames.region
         self.stated = {name: texts[numbers].tolist() for name, texts in (stated or {}).items()}
         self._marked, self._top = marked, top
         if "flat" in self.fields:

@@ -27,7 +27,7 @@ from mvrecon.data.linked import (
     values_at,
 )
 from mvrecon.data.projections import exposures, nexus_axes, nexus_detector
-from mvrecon.data.projections.frames import EXPECTED, Frames, FrameViews
+from mvrecon.data.projections.frames import EXPECTED, REGION, Frames, FrameViews
 from mvrecon.data.projections.nexus_detector import (
     ALIGNMENT,
     BEAM,
@@ -84,6 +84,7 @@ KEYS = (
         "compared",
         "with the order of frames, rows and columns, as axes of NXdata",
     ),
+    Key(", ".join(REGION), "compared", "areaDetector's, of views and fields"),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
     Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
     Key(
@@ -381,10 +382,10 @@ class _Layout(NamedTuple):
             return np.zeros(count, int)
         if self.sinogram:
             raise Refused(f"{self.key}: expected no keys of sinograms, got some")
-        keys = values_at(self.key, EXPECTED)
-        if keys.shape != (count,):
+        stored = values_at(self.key, EXPECTED)
+        if (keys := stored.ravel()).shape != (count,) or max(stored.shape) < count:
             raise Refused(
-                f"{self.key}: expected a key for each of {count} frames, got {keys.shape}"
+                f"{self.key}: expected a key for each of {count} frames, got {stored.shape}"
             )
         if unknown := sorted({*keys.tolist()} - {VIEW, FLAT, DARK, INVALID, ALIGNMENT}):
             raise Refused(

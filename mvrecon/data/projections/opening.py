@@ -158,7 +158,7 @@ def exposures(
         except FileNotFoundError as error:
             known = [name for name in stack.stated if exposure_names(stack, name)]
             raise FileNotFoundError(
-                f"{error}{_absent(stack, path)}; by name, each view states "
+                f"{error}{_absent(stack, f'data set {path}')}; by name, each view states "
                 f"{', '.join(known) or 'no exposure'}"
             ) from error
     if len(values) != stack.n_views or not (np.isfinite(values) & (values > 0)).all():
@@ -204,6 +204,7 @@ def mean_field(
         raise Refused(
             f"{where}: expected a flat field for intensities; give flat=<path or grey value>, "
             f"or kind=integrals or kind=counts (of a command, views.flat and views.kind)"
+            f"{_absent(views, 'flat field')}"
         )
     if stack.shape != views.shape:
         raise Refused(
@@ -269,7 +270,7 @@ def _field_at(
         try:
             other = open_projections(value)
         except FileNotFoundError as error:
-            raise FileNotFoundError(f"{error}{_absent(views, value)}") from error
+            raise FileNotFoundError(f"{error}{_absent(views, f'data set {value}')}") from error
         field = other.fields.get(name, other)  # of a scan that has one
         stack = field if isinstance(field, ProjectionStack) else other
     return as_rows(stack, views.shape) if layout == "sinogram" else stack
@@ -285,9 +286,9 @@ def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:
         return place if isinstance(file[place.name], Dataset) else None
 
 
-def _absent(views: ProjectionStack, name: str | Path) -> str:
-    """The end of a message: that the scan's HDF5 file has no data set of a name; else empty."""
+def _absent(views: ProjectionStack, name: str) -> str:
+    """The end of a message: that the scan's HDF5 file lacks what is named; else empty."""
     if views.scan is None:
         return ""
     contained = listing(views.scan, EXPECTED)
-    return f"; {views.scan} has no data set {name}, it contains {contained}"
+    return f"; {views.scan} has no {name}, it contains {contained}"

@@ -182,12 +182,12 @@ def test_a_volume_of_interfile_without_a_third_axis_has_that_of_its_slices(tmp_p
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-8", "utf-8-sig"])
 @pytest.mark.parametrize("folder", ["", "./", "{}/"])
 def test_a_header_of_another_encoding_with_the_path_of_its_data_is_read(encoding, folder, tmp_path):
-    """A patient's name in Latin-1, a byte order mark, and the path as GATE writes it; the data of
+    """Names in Latin-1, a byte order mark, and the path of the data as GATE writes it; the data of
     a folder that is not below are refused, also where a file beside the header has their name.
     """
-    text = SLICES.replace(":= a.v", f":= {folder.format(tmp_path)}a.v")
+    text = SLICES.replace(":= a.v", f":= {folder.format(tmp_path)}ä.v")
     text = text.replace("!GENERAL DATA :=", "patient name := Müller")
-    VALUES.tofile(tmp_path / "a.v")
+    VALUES.tofile(tmp_path / "ä.v")
     (tmp_path / "a.hv").write_bytes(text.encode(encoding))
     assert np.array_equal(read_interfile(tmp_path / "a.hv")[0], VALUES)
     for other in ("/data/a.v", "../a.v", f"{tmp_path}/other/a.v", "."):
@@ -305,7 +305,7 @@ def test_every_key_to_refuse_is_refused_by_name(header: str, key: str, tmp_path:
         "pixel value offset := 10",
         "calibration factor (Bq/ml) := 3",
         "image data units := Bq/ml",
-        "scale factor (mm/pixel) [1] := 4",
+        "scale factor (cm/pixel) [1] := 4",
         "data compression method := gzip",
     ],
 )
@@ -329,6 +329,12 @@ BOTH = [
     "% quantification units := 2",
     "%quantification units[1] := 2",
     "%rescale slope := 2",
+    "NUD/rescale slope := +2.000000e+00",
+    "NUD/rescale intercept := -1.000000e+03",
+    "%image slope := 2",
+    "%x-offset (mm) := 3.0",
+    "gain corrected := 1",
+    "log scale := 1",
     "%data offset in bytes := 0",
     "%imagedata byte order := LITTLEENDIAN",
     "%number format := signed integer",
@@ -478,7 +484,7 @@ def test_no_spelling_of_a_key_escapes_the_table(header: str, line: str, tmp_path
     does not exist, 0, no number, twice, open; with "%"; with "_" for blanks, without blanks, in
     American; with a slip; with "=" or ":" for ":="; of another unit; or as words of no table.
     """
-    key = line.replace("_", " ").strip("% ").lower()
+    key = line.replace("_", " ").strip("% ").lower().removeprefix("nud/")
     base = key.partition(":")[0].partition("=")[0].partition("[")[0].strip()
     with pytest.raises(Refused) as refused:
         read(tmp_path, header, line)
@@ -486,6 +492,9 @@ def test_no_spelling_of_a_key_escapes_the_table(header: str, line: str, tmp_path
 
 
 HARMLESS = [
+    *("%image slope := 1", "%image intercept := 0.0", "%x-offset (mm) := 0.0"),
+    *("NUD/rescale slope := +1.000000e+00", "NUD/rescale intercept := +0.000000e+00"),
+    *("%patient orientation := HFS", "collimator thickness := 3.5"),
     "%decay corrected := N",
     "scatter correction := none",
     "%decay correction :=",
@@ -538,6 +547,14 @@ OF_RECONSTRUCTIONS = [
 def test_keys_without_effect_are_accepted(header: str, line: str, tmp_path: Path):
     """Keys of STIR 6, GATE, SIMIND, XMedCon and Siemens, with values that change nothing."""
     assert np.array_equal(read(tmp_path, header, line), VALUES.astype("f4"))
+
+
+@pytest.mark.parametrize("header", [IMAGE, ATTMAP])
+def test_the_voxel_size_is_read_as_siemens_spells_it(header: str, tmp_path: Path):
+    read(tmp_path, header)
+    spelled = header.replace("scaling factor (mm/pixel)", "scale factor (mm/pixel)")
+    (tmp_path / "b.hv").write_text(spelled)
+    assert read_interfile(tmp_path / "b.hv")[1].spacing == (2.5, 2.5, 5.0)
 
 
 @pytest.mark.parametrize(

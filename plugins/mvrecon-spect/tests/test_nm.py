@@ -38,7 +38,8 @@ def test_angles_follow_the_direction_from_each_detector_s_start(nm: NmStudy):
 def test_heads_without_a_start_angle_are_asked_for_it(tmp_path: Path):
     """Two heads of a rotation with a start angle: each head's own is needed, and neither where the
     rotation has none, either. Heads may state the same angle; one head takes the rotation's. Of
-    several rotations, each with a start angle, those of the heads are unknown.
+    several rotations, each with a start angle, those of the heads are unknown, but where each head
+    has a rotation of its own that starts at its angle.
     """
     from pydicom.dataset import Dataset
 
@@ -70,6 +71,14 @@ def test_heads_without_a_start_angle_are_asked_for_it(tmp_path: Path):
     one |= {"EnergyWindowVector": [1] * 6 + [2] * 6}
     alone = read_nm(study(tmp_path / "f.dcm", **one, **heads(None), **turns(10.0)))
     assert [view.angle_degrees for view in alone.views][:2] == [10.0, 340.0]
+    each: dict[str, list[int]] = {"RotationVector": ([1] * 3 + [2] * 3) * 2}
+    each |= {"EnergyWindowVector": [1] * 6 + [2] * 6, "AngularViewVector": [1, 2, 3] * 4}
+    each["DetectorVector"] = each["RotationVector"]
+    own = read_nm(study(tmp_path / "g.dcm", **each, **heads(10.0, 190.0), **turns(10.0, -170.0)))
+    assert [view.angle_degrees for view in own.views] == [10.0, 340.0, 310.0, 190.0, 160.0, 130.0]
+    for starts in ((10.0, 10.0), (190.0, 10.0)):
+        with pytest.raises(ValueError, match="got 2 with a StartAngle each"):
+            read_nm(study(tmp_path / "h.dcm", **each, **heads(10.0, 190.0), **turns(*starts)))
 
 
 def test_a_dynamic_study_is_read_frame_by_frame(tmp_path: Path):

@@ -126,6 +126,15 @@ LAYOUTS = {
         tomo(folder / "a.nxs", sample__rotation_angle=ANGLES),
         {},
     ),
+    "keys and angles as rows": lambda folder: (
+        tomo(
+            folder / "a.nxs",
+            sample__rotation_angle=angles()[None],
+            instrument__detector__image_key_control=None,
+            instrument__detector__image_key=np.where(KEYS == -1, 3, KEYS)[None].astype("f8"),
+        ),
+        {},
+    ),
     "radians": lambda folder: (
         tomo(folder / "a.nxs", unit=b"rad", sample__rotation_angle=np.radians(ANGLES)),
         {},
@@ -483,6 +492,55 @@ def test_a_pixel_size_without_units_is_not_used(tmp_path):
 def test_beams_of_tubes_are_not_parallel(source, beam, tmp_path):
     path = tomo(tmp_path / "a.nxs", instrument__source__type=np.bytes_(source))
     assert opened(path).stack.rig["name"] is beam
+
+
+def area(path, name, **attributes):
+    """A file of Data Exchange or NXtomo with attributes of areaDetector or silx at a place."""
+    with h5py.File(path, "a") as file:
+        file[name].attrs.update(attributes)
+    return path
+
+
+def detector(offset=(0, 0), binning=(1, 1)):
+    """What areaDetector states of the part of the detector in each of its data sets, x first."""
+    names = ("NDArrayDimOffset", "NDArrayDimBinning", "NDArrayDimReverse")
+    pairs = zip(names, (offset, binning, (0, 0)), strict=True)
+    return {name: np.array(pair, "i4") for name, pair in pairs}
+
+
+@pytest.mark.parametrize("part", [{}, {"offset": (320, 512)}, {"binning": (2, 2)}])
+def test_views_and_fields_of_one_part_of_the_detector(part, tmp_path):
+    """areaDetector states offset and binning, which are those of views and fields; other ones are
+    refused by name, also of fields in a file of their own.
+    """
+    path = exchange(tmp_path / "a.h5")
+    for name in ("data", "data_white", "data_dark"):
+        area(path, f"exchange/{name}", **detector(**part))
+    assert np.allclose(opened(path).whole().views, integrals(), atol=1e-6)
+    other = area(exchange(tmp_path / "b.h5"), "exchange/data_white", **detector((8, 0), (4, 4)))
+    with pytest.raises(Refused, match="flat field with the NDArrayDim(Offset|Binning)"):
+        opened(path, flat=f"{other}:/exchange/data_white")
+
+
+@pytest.mark.parametrize("name", ["/", "entry", "entry/sample", "entry/instrument/detector/data"])
+def test_the_kind_of_a_scale_of_a_plot_is_no_scale(name, tmp_path):
+    """As nxtomo writes it for silx. Neutral numbers of each axis change nothing; others do."""
+    styles = {f"SILX_style/{kind}": "linear" for kind in ("axis_scale_types", "signal_scale_type")}
+    styles["SILX_style/axis_scale_types"] = ["linear", "linear"]
+    path = area(tomo(tmp_path / "a.nxs"), name, **styles, scale_factor=[1.0, 1.0], offset=[0, 0])
+    assert np.allclose(opened(path).whole().views, integrals(), atol=1e-6)
+    with pytest.raises(Refused, match=r"scale_factor.*\[1.0, 2.0\]"):
+        opened(area(path, name, scale_factor=[1.0, 2.0]))
+
+
+def test_a_flat_field_of_another_name_is_listed_and_read(tmp_path):
+    """As the SLS names those before and behind the views."""
+    flat = np.full((2, ROWS, COLUMNS), FLAT, "u2")
+    path = exchange(tmp_path / "a.h5", data_white=None, data_white_pre=flat, data_white_post=flat)
+    with pytest.raises(Refused, match="no flat field, it contains .*/exchange/data_white_pre"):
+        opened(path)
+    views = opened(path, flat="exchange/data_white_pre").whole().views
+    assert np.allclose(views, integrals(), atol=1e-6)
 
 
 CHANGED = {

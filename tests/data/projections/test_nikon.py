@@ -195,6 +195,8 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
         ("tooth.ang", "3:\t70.0\n2:\t40.01\n1:\t10.0\n", False),
         ("_ctdata.txt", "Projection Angle Time\n1 350.0 0.5\n2 20.0 1\n3 50.0 1.5\n", False),
         ("_ctdata.txt", "no angles\n", False),
+        ("_ctdata.txt", "Projs Start\n3 -180\nProj Angle\n1 10 0\n2 40 1\n3 70 2\n", False),
+        ("_ctdata.txt", "Projs Start\n3 -180\nProj Angle\n1 10 0\n2 20 1\n3 70 2\n", True),
     ],
 )
 def test_measured_angles_in_other_steps_are_warned_of(name, text, warned, tmp_path):

@@ -21,6 +21,8 @@ FORMS = {
     "j.tsv": "\tangle\n" + "\n".join(f"{k}\t{a}" for k, a in enumerate(ANGLES)),
     "k.csv": "time,angle\n" + "\n".join(f"10:00 {k},{a}" for k, a in enumerate(ANGLES)),
     "l.txt": f"Angle (deg)\n{COLUMN}",
+    "m.csv": "Bild;Angle (°)\n" + "\n".join(f"{k};{a}" for k, a in enumerate(ANGLES)),
+    "n.csv": f"Angle (°)\n{COLUMN}",  # in Latin-1, as programs of Windows write it
     "f.tsv": "view\trotation\n" + "\n".join(f"{k}\t{a}" for k, a in enumerate(ANGLES)),
 }
 
@@ -37,7 +39,7 @@ def test_angles_in_a_file_are_those_of_the_rig(name, rig, tmp_path):
         values = np.array(ANGLES, "f4" if name < "h" else "f8")
         np.save(path, values[:, None] if name < "h" else values)
     else:
-        path.write_text(FORMS[name])
+        path.write_bytes(FORMS[name].encode("latin-1" if name == "n.csv" else "utf-8"))
     assert torch.equal(rig(tmp_path / name).origin, rig(ANGLES).origin)
 
 

@@ -104,7 +104,7 @@ def number_lines(path: str | Path) -> list[list[float]]:
         Refused: too large, not text, or not finite numbers; the message names the line.
     """
     lines = []
-    for count, line in enumerate(text_of(path).splitlines(), 1):
+    for count, line in enumerate(text_of(path, strict=False).splitlines(), 1):
         words = re.split(r"[\s,;]+", line.partition("#")[0].strip())
         try:
             values = [number(word, f"line {count}") for word in words if word]
@@ -178,7 +178,8 @@ def _column(
     path: Path, column: str | None, what: str, known: re.Pattern
 ) -> tuple[str, list[float]]:
     """The name and the numbers of a column of a text."""
-    lines = [line.partition("#")[0].strip(" ") for line in text_of(path).splitlines()]
+    whole = text_of(path, strict=False)
+    lines = [line.partition("#")[0].strip(" ") for line in whole.splitlines()]
     lines = [line for line in lines if line.strip()]
     if all(re.fullmatch(r"[^,;\t]+[,;\t]?", line) for line in lines):
         lines = [line.rstrip(",;\t") for line in lines]

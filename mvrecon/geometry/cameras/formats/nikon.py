@@ -69,7 +69,7 @@ KEYS = (
     Key("XraykV, XrayuA", "ignored", "the tube"),
 )
 #: A line of measured angles: number of the projection and degrees; share by which steps may differ.
-LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*\d+[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
+LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*(\d+)[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
 KNOWN = {name.lower() for key in KEYS for name in key.names}
 #: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
 NIKON_EFFECTS = {
@@ -210,9 +210,11 @@ def read(path: str | Path) -> Cameras:
 def _warn_of_steps(path: str | Path, step: float) -> None:
     """Warn of a list of measured angles, .ang or _ctdata.txt, in other steps."""
     for file in sorted([*Path(path).parent.glob("*.ang"), *Path(path).parent.glob("*_ctdata.txt")]):
-        lines = map(LISTED.match, text_of(file, errors="replace").splitlines())
-        angles = torch.tensor([float(line[1]) for line in lines if line], dtype=torch.float64)
+        lines = map(LISTED.match, text_of(file, strict=False).splitlines())
+        listed = [[float(line[1]), float(line[2])] for line in lines if line]
+        numbers, angles = torch.tensor(listed, dtype=torch.float64).reshape(-1, 2).T
         steps = (angles.diff().abs() + 180) % 360 - 180  # of either sense
+        steps = steps[numbers.diff().abs() == 1]  # headings may be numbers as well
         off = (steps.abs() - abs(step)).abs()
         if len(off) and off.max() > MAX_STEP_DIFFERENCE * abs(step):
             warnings.warn(

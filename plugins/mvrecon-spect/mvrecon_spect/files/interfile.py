@@ -19,12 +19,13 @@ import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_beside, plain_name, shown, text_of
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import Key, check_keys, has_effect
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.formats.common import number
 from mvrecon_spect.files.interfile_keys import (
     CONTENT,
     EFFECT,
+    EFFECTS,
     KEYS,
     NOTHING,
     SECTIONS,
@@ -122,7 +123,7 @@ def read_header(path: str | Path, content: Content) -> Header:
     path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected an Interfile header")
-    text = text_of(path, errors="surrogateescape")  # names of patients
+    text = text_of(path, strict=False)
     text = re.sub(r"\\\r?\n", "", text)
     lines = [line.partition(";")[0].strip() for line in text.splitlines()]
     pairs = [(_name(key), value) for key, mark, value in (x.partition(":=") for x in lines) if mark]
@@ -209,7 +210,7 @@ def _check_key(
     elif not indices and value.lower() not in NOTHING:
         known = {base.replace(" ", ""): base for base in table if _used(_Name(base), table)}
         near = difflib.get_close_matches(name.base.replace(" ", ""), known, n=1, cutoff=SLIP)
-        if near or EFFECT.search(str(name)):
+        if near or (EFFECT.search(str(name)) and has_effect(str(name), value, EFFECTS)):
             slip = f"; did you mean {known[near[0]]!r}? Else" if near else ";"
             raise Refused(
                 f"{path}: expected keys whose effect is known, got {str(name)!r} := {value!r}"

@@ -3,6 +3,7 @@
 import re
 from typing import Literal
 
+from mvrecon.core.files import keys
 from mvrecon.core.files.keys import Key
 
 Content = Literal["projections", "volume"]
@@ -54,7 +55,7 @@ KEYS = (
         "patient orientation",
         "refused",
         "no world has these axes; without the key they are the scanner's",
-        ("head_in", "head in", "unknown"),
+        ("head_in", "head in", "hfs", "hfp", "unknown"),
     ),
     Key(
         "patient rotation",
@@ -195,19 +196,26 @@ EFFECT = re.compile(
     r"smooth|filter|compress|encod|interleav|endian|byte|format|truncat|look.?up|"
     r"interpolat|recovery|weighting|divide|padding|skip|block|mask|rebin|binning|mashing|"
     r"transpos|mirror|invert|revers|magnif|rotat|clockwise|orient|direction|translat|ang(le|ul)|"
-    r"separation|spacing|distance|pitch|thickness|width|"
+    r"separation|spacing|distance|pitch|(?<!collimator )thickness|width|"
     r"number of|centre of|centre \(|frame|windows|heads|(head|feet) first|header (length|size)|"
     r"(data|sample|pixel|voxel) type|"
     r"\b(gains?|bias|log|power|complex|suv|units?|origins?|shift\w*|positions?|zoom\w*|flip\w*|"
     r"tilt\w*|clip\w*|orders?|major|bits?|signed|sizes?|orbits?|arc|radius|radii|axis|axes|gates|"
     r"dimensions)\b"
 )
+#: Values of such a key that change nothing, by its words: 1 of slopes, 0 of offsets.
+EFFECTS = {EFFECT.pattern: None, **keys.EFFECTS, r"\b(log|power)\b|correct": None}
 #: Similarity of an unknown key to one of the tables, by `difflib`, from which it may be a slip.
 SLIP = 0.9
 #: Values of an unknown key that has no effect.
 NOTHING = {"", "none", "unknown", "{}", "{none}"}
-#: Other spellings of known keys: American, and Siemens'.
-SPELLINGS = {"center": "centre", "image data byte order": "imagedata byte order"}
+#: Other spellings of known keys: American, Siemens', and (X)MedCon's of the group "NUD/".
+SPELLINGS = {
+    "center": "centre",
+    "image data byte order": "imagedata byte order",
+    "scale factor (mm/pixel)": "scaling factor (mm/pixel)",
+    "nud/": "",
+}
 #: Keys that repeat the number of images of a file.
 IMAGES = ("total number of images", "number of images/window", "number of images/energy window")
 #: Numbers of sections of a header; each section repeats its keys.

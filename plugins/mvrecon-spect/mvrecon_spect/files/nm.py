@@ -333,28 +333,33 @@ def _window(dataset: Any, index: int) -> EnergyWindow:
 
 
 def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
-    """Raise if several detectors would get the same angles because only their rotation states a
-    start angle, or each of several rotations.
+    """Raise if several detectors of a rotation would get the same angles because only the rotation
+    states a start angle, or each of several.
     """
-    detectors, turns = sorted({view[0] for view in views}), sorted({view[1] for view in views})
-    own = [_start(dataset, "DetectorInformationSequence", number) for number in detectors]
-    of_turns = [_start(dataset, "RotationInformationSequence", number) for number in turns]
-    if len(detectors) < 2 or of_turns.count(None) == len(turns):
-        return
-    if None in own:
-        without = [n for n, start in zip(detectors, own, strict=True) if start is None]
-        raise Refused(
-            f"{path}: expected a StartAngle of each of the {len(detectors)} detectors, got none of "
-            f"detector {', '.join(map(str, without))}: by that of the rotation alone, "
-            f"{of_turns[0]}, the heads would all have the same angles; set it in "
-            f"DetectorInformationSequence"
-        )
-    if len(turns) > 1 and len(set(own)) > 1:
-        raise Refused(
-            f"{path}: expected one rotation of detectors with different StartAngle, got "
-            f"{len(turns)} with a StartAngle each, which does not say where each detector starts; "
-            f"write a file for each rotation"
-        )
+    turns = sorted({view[1] for view in views})
+    for turn in turns:
+        detectors = sorted({view[0] for view in views if view[1] == turn})
+        start = _start(dataset, "RotationInformationSequence", turn)
+        if start is None:
+            continue
+        own = [_start(dataset, "DetectorInformationSequence", number) for number in detectors]
+        if None in own and len(detectors) > 1:
+            without = [n for n, angle in zip(detectors, own, strict=True) if angle is None]
+            raise Refused(
+                f"{path}: expected a StartAngle of each of the {len(detectors)} detectors, got "
+                f"none of detector {', '.join(map(str, without))}: by that of the rotation alone, "
+                f"{start}, the heads would all have the same angles; set it in "
+                f"DetectorInformationSequence"
+            )
+        elsewhere = {view[0] for view in views if view[1] != turn}
+        only = {angle for n, angle in zip(detectors, own, strict=True) if n not in elsewhere}
+        agrees = all(_alike("StartAngle", angle, start) for angle in only - {None})
+        if len(turns) > 1 and (len(set(own)) > 1 or not agrees):
+            raise Refused(
+                f"{path}: expected one rotation of detectors with different StartAngle, got "
+                f"{len(turns)} with a StartAngle each, which does not say where each detector "
+                f"starts; write a file for each rotation"
+            )
 
 
 def _start(dataset: Any, name: str, index: int) -> float | None:
