@@ -226,6 +226,8 @@ class LinearOperator:
         """A plane of symmetry, A(F x) = G(A x); None if not known."""
         return None
 
+    #: Whether pixels are expected counts of a volume that emits, in place of line integrals.
+    emission = False
     #: Whether each sample of a batch has its own operator.
     per_sample = False
 
@@ -259,6 +261,10 @@ class Derived(LinearOperator):
     @property
     def device(self) -> torch.device:
         return self.A.device
+
+    @property
+    def emission(self) -> bool:
+        return self.A.emission
 
     @property
     def pose_gradient(self) -> bool:

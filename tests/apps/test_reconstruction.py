@@ -696,6 +696,6 @@ def test_line_integrals_are_no_counts(scan, monkeypatch):
         ("counts", measured.stack.unit, "got line integrals in 1/mm \\* mm"),
         ("drr", "counts of activity", "made them is 'counts'"),
     ):
-        case = Scan(measured, cameras, Grid.centred(4, spacing=48.0), {"name": name})
+        A = PROJECTORS.build(name, grid=Grid.centred(4, spacing=48.0), cameras=cameras)
         with pytest.raises(ValueError, match=message):
-            check_unit(unit, case, 0)
+            check_unit(unit, name, A)

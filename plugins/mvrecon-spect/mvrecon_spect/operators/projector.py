@@ -92,6 +92,8 @@ class Spect(Scaled):
             1/mm, or thin rays with blur, attenuation or pixels wider than a voxel's image.
     """
 
+    emission = True
+
     def __init__(
         self,
         grid: Grid,
