@@ -339,12 +339,13 @@ def _read(
             f"{path}: expected views [m v u] of the measured counts' sizes {sizes[0]}, got "
             f"{sizes[1]}"
         )
-    counts = other.whole().views[None, None]
+    whole = other.whole()
+    counts = whole.views[None, None]
     if relative:
         return counts
     _check_dose(other, "scatter")
     if widths_kev is not None:
-        _check_window(views, other, counts, widths_kev)
+        _check_window(views, other, whole, widths_kev)
     own, others = views.stack, other.stack
     apart = abs(own.began - others.began) if own.began and others.began else timedelta(0)
     if apart > MAX_APART:
@@ -370,12 +371,12 @@ def _read(
 def _check_window(
     views: MeasuredViews,
     other: MeasuredViews,
-    counts: Float[Tensor, "1 1 m v u"],
+    counts: Corrected,
     widths_kev: tuple[float | None, float | None],
 ) -> None:
     """Check that counts are those of another energy window than the views'; see `_read`."""
-    own, window = views.stack.window_kev, other.stack.window_kev
-    if (own and own == window) or (counts.any() and torch.equal(counts[0, 0], views.whole().views)):
+    own, window, values = views.stack.window_kev, other.stack.window_kev, counts.views
+    if (own and own == window) or (values.any() and torch.equal(values, views.whole().views)):
         raise Refused(
             f"{other.options.path}: expected the counts of another energy window for scatter, got "
             f"those of the views; DICOM NM names its windows, as in tomo.dcm:/window1"
@@ -387,7 +388,7 @@ def _check_window(
                 f"{one.options.path}: expected widths_kev with the {high - low:g} keV of its "
                 f"energy window, got {width:g}"
             )
-    if (counts != counts.round()).any():
+    if ((values != values.round()) & counts.mask).any():
         warnings.warn(
             f"{other.options.path}: expected whole numbers as the counts of an energy window, got "
             f"others; they must be smoothed alone, not scaled",

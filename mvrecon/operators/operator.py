@@ -267,6 +267,10 @@ class Derived(LinearOperator):
         return self.A.emission
 
     @property
+    def grid(self) -> Grid:
+        return self.A.grid
+
+    @property
     def pose_gradient(self) -> bool:
         return self.A.pose_gradient
 
@@ -296,6 +300,8 @@ class Composed(nn.Module, LinearOperator):
         ValueError: shapes that do not agree.
     """
 
+    B: Any
+
     def __init__(self, A: LinearOperator, B: LinearOperator):
         super().__init__()
         if A.domain_shape != B.range_shape:
@@ -309,6 +315,14 @@ class Composed(nn.Module, LinearOperator):
         return self.B.device
 
     @property
+    def emission(self) -> bool:
+        return self.B.emission
+
+    @property
+    def grid(self) -> Grid:
+        return self.B.grid
+
+    @property
     def pose_gradient(self) -> bool:
         return self.A.pose_gradient or self.B.pose_gradient
 
@@ -318,6 +332,10 @@ class Composed(nn.Module, LinearOperator):
     def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
         return self.B.adjoint(self.A.adjoint(y))
 
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
+        """B's."""
+        return self.B.mu_map()
+
 
 class Wrapped(Derived, Projector):
     """A projector derived from another operator, with its shapes, device, grid and cameras."""
@@ -326,10 +344,6 @@ class Wrapped(Derived, Projector):
         super().__init__()
         self.A = A
         self.domain_shape, self.range_shape = A.domain_shape, A.range_shape
-
-    @property
-    def grid(self) -> Grid:
-        return self.A.grid
 
     @property
     def cameras(self) -> Cameras:
