@@ -25,7 +25,7 @@ from mvrecon.apps import correction, run_method
 from mvrecon.apps.config import compose, help_text
 from mvrecon.apps.output import Output
 from mvrecon.apps.progress import logger
-from mvrecon.apps.scan import Scan, check_unit
+from mvrecon.apps.scan import check_unit
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
