@@ -47,9 +47,6 @@ from mvrecon.training.trained_method import TrainedMethod
 MIN_HELD_VOLUMES = 3
 #: Pixels by which a detector's offset may differ from the one by the views' file, for rounding.
 MAX_OFFSET_PX = 0.01
-#: Share of the grid's diagonal. Views of a volume of ones exceed it if the projector takes line
-#: integrals, and never if it counts photons behind pinholes.
-MIN_LINE_INTEGRAL_SHARE = 0.02
 #: Time between measurements of which neither is corrected for decay; relative difference of the
 #: widths of an energy window.
 MAX_APART, MAX_WIDTH_DIFFERENCE = timedelta(minutes=1), 0.01
@@ -252,15 +249,11 @@ def open_scan(
     )
     scan = Scan(measured, cameras, voxels, projector, rig=rig)
     unit = measured.stack.unit
+    A = _coarse(scan, seeing)
     if unit is not None:
-        check_unit(unit, scan, seeing)
-    A, largest = _coarse(scan, seeing)
-    emits = (
-        not sees_integrals(A) and 0 < largest < MIN_LINE_INTEGRAL_SHARE
-        if unit is None
-        else " of " in unit
-    )
-    if emits:
+        check_unit(unit, projector["name"], A)
+    stated = measured.kind == "counts" or (unit or "").endswith(f" of {EMISSION}")
+    if A.emission or stated and not sees_integrals(A):
         scan = replace(scan, measured=measured.as_counts(), unit=EMISSION, counts=True)
     elif measured.kind == "counts":
         raise Refused(
@@ -346,12 +339,13 @@ def _read(
             f"{path}: expected views [m v u] of the measured counts' sizes {sizes[0]}, got "
             f"{sizes[1]}"
         )
-    counts = other.whole().views[None, None]
+    whole = other.whole()
+    counts = whole.views[None, None]
     if relative:
         return counts
     _check_dose(other, "scatter")
     if widths_kev is not None:
-        _check_window(views, other, counts, widths_kev)
+        _check_window(views, other, whole, widths_kev)
     own, others = views.stack, other.stack
     apart = abs(own.began - others.began) if own.began and others.began else timedelta(0)
     if apart > MAX_APART:
@@ -377,12 +371,12 @@ def _read(
 def _check_window(
     views: MeasuredViews,
     other: MeasuredViews,
-    counts: Float[Tensor, "1 1 m v u"],
+    counts: Corrected,
     widths_kev: tuple[float | None, float | None],
 ) -> None:
     """Check that counts are those of another energy window than the views'; see `_read`."""
-    own, window = views.stack.window_kev, other.stack.window_kev
-    if (own and own == window) or (counts.any() and torch.equal(counts[0, 0], views.whole().views)):
+    own, window, values = views.stack.window_kev, other.stack.window_kev, counts.views
+    if (own and own == window) or (values.any() and torch.equal(values, views.whole().views)):
         raise Refused(
             f"{other.options.path}: expected the counts of another energy window for scatter, got "
             f"those of the views; DICOM NM names its windows, as in tomo.dcm:/window1"
@@ -394,7 +388,7 @@ def _check_window(
                 f"{one.options.path}: expected widths_kev with the {high - low:g} keV of its "
                 f"energy window, got {width:g}"
             )
-    if (counts != counts.round()).any():
+    if ((values != values.round()) & counts.mask).any():
         warnings.warn(
             f"{other.options.path}: expected whole numbers as the counts of an energy window, got "
             f"others; they must be smoothed alone, not scaled",
@@ -422,41 +416,40 @@ def _check_dose(views: MeasuredViews, purpose: str) -> None:
         )
 
 
-def check_unit(unit: str, scan: Scan, view: int) -> None:
+def check_unit(unit: str, name: str, A: Projector) -> None:
     """Check that the views have the projector's unit: line integrals or not.
 
     Args:
         unit: unit in the views' file: "... * mm" of line integrals, "<projector> of ..." of others.
-        scan: the scan with these views.
-        view: one that sees the grid.
+        name: name of the projector.
+        A: the projector.
 
     Raises:
-        Refused: line integrals for a projector of counts, or counts for one of line integrals.
+        Refused: line integrals for a projector of counts or of weighted integrals, or counts for
+            one of line integrals.
     """
-    share, name = _coarse(scan, view)[1], scan.projector["name"]
-    if unit.endswith("* mm") and 0 < share < MIN_LINE_INTEGRAL_SHARE:
+    maker, _, quantity = unit.partition(" of ")
+    weighted = A.pixel_integral() is not None and not sees_integrals(A)
+    if unit.endswith("* mm") and (A.emission or weighted):
         raise Refused(
             f"expected views in the unit of the projector {name!r}, got line integrals in {unit}; "
             f"projector=drr is for those"
         )
-    if " of " in unit and share >= MIN_LINE_INTEGRAL_SHARE:
+    if quantity and sees_integrals(A):
         raise Refused(
             f"expected line integrals for the projector {name!r}, got views in the unit {unit!r}; "
-            f"the projector that made them is {unit.partition(' of ')[0]!r}"
+            f"the projector that made them is {maker!r}"
         )
 
 
-def _coarse(scan: Scan, view: int) -> tuple[Projector, float]:
-    """The operator of a view of 2 x 2 x 2 voxels in the grid's box, and the greatest value that
-    ones have there, relative to the box's diagonal.
-    """
+def _coarse(scan: Scan, view: int) -> Projector:
+    """The operator of a view of 2 x 2 x 2 voxels in the grid's box."""
     affine = scan.grid.affine.clone()
     affine[:3, :3] *= torch.tensor(scan.grid.size, dtype=affine.dtype) / 2
     affine[:3, 3] = scan.grid.centre - affine[:3, :3].sum(dim=1) / 2
     blocks = Grid((2, 2, 2), affine)
-    A = PROJECTORS.from_config(scan.projector, grid=blocks, cameras=scan.cameras[view : view + 1])
-    most = A(torch.ones(1, 1, *blocks.shape)).max().item()
-    return A, most / (affine[:3, :3].sum(dim=1) * 2).norm().item()
+    one = scan.cameras[view : view + 1]
+    return PROJECTORS.from_config(scan.projector, grid=blocks, cameras=one)
 
 
 def _detector(measured: MeasuredViews) -> dict[str, tuple]:

@@ -226,6 +226,8 @@ class LinearOperator:
         """A plane of symmetry, A(F x) = G(A x); None if not known."""
         return None
 
+    #: Whether pixels are expected counts of a volume that emits, in place of line integrals.
+    emission = False
     #: Whether each sample of a batch has its own operator.
     per_sample = False
 
@@ -261,6 +263,14 @@ class Derived(LinearOperator):
         return self.A.device
 
     @property
+    def emission(self) -> bool:
+        return self.A.emission
+
+    @property
+    def grid(self) -> Grid:
+        return self.A.grid
+
+    @property
     def pose_gradient(self) -> bool:
         return self.A.pose_gradient
 
@@ -290,6 +300,8 @@ class Composed(nn.Module, LinearOperator):
         ValueError: shapes that do not agree.
     """
 
+    B: Any
+
     def __init__(self, A: LinearOperator, B: LinearOperator):
         super().__init__()
         if A.domain_shape != B.range_shape:
@@ -303,6 +315,14 @@ class Composed(nn.Module, LinearOperator):
         return self.B.device
 
     @property
+    def emission(self) -> bool:
+        return self.B.emission
+
+    @property
+    def grid(self) -> Grid:
+        return self.B.grid
+
+    @property
     def pose_gradient(self) -> bool:
         return self.A.pose_gradient or self.B.pose_gradient
 
@@ -312,6 +332,10 @@ class Composed(nn.Module, LinearOperator):
     def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
         return self.B.adjoint(self.A.adjoint(y))
 
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
+        """B's."""
+        return self.B.mu_map()
+
 
 class Wrapped(Derived, Projector):
     """A projector derived from another operator, with its shapes, device, grid and cameras."""
@@ -320,10 +344,6 @@ class Wrapped(Derived, Projector):
         super().__init__()
         self.A = A
         self.domain_shape, self.range_shape = A.domain_shape, A.range_shape
-
-    @property
-    def grid(self) -> Grid:
-        return self.A.grid
 
     @property
     def cameras(self) -> Cameras:

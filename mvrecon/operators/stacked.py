@@ -49,6 +49,10 @@ class Stacked(Projector):
         self.capabilities = frozenset.intersection(*(A.capabilities for A in operators))
 
     @property
+    def emission(self) -> bool:
+        return self.operators[0].emission
+
+    @property
     def grid(self) -> Grid:
         return self.operators[0].grid
 

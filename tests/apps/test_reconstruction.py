@@ -25,7 +25,7 @@ from mvrecon.apps import correction, run_method
 from mvrecon.apps.config import compose, help_text
 from mvrecon.apps.output import Output
 from mvrecon.apps.progress import logger
-from mvrecon.apps.scan import Scan, check_unit
+from mvrecon.apps.scan import check_unit
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.attenuation import WATER
@@ -696,6 +696,6 @@ def test_line_integrals_are_no_counts(scan, monkeypatch):
         ("counts", measured.stack.unit, "got line integrals in 1/mm \\* mm"),
         ("drr", "counts of activity", "made them is 'counts'"),
     ):
-        case = Scan(measured, cameras, Grid.centred(4, spacing=48.0), {"name": name})
+        A = PROJECTORS.build(name, grid=Grid.centred(4, spacing=48.0), cameras=cameras)
         with pytest.raises(ValueError, match=message):
-            check_unit(unit, case, 0)
+            check_unit(unit, name, A)

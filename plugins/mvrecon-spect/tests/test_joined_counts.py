@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import pytest
 import torch
 
@@ -54,3 +55,22 @@ def test_counts_and_line_integrals_are_not_confused(measured, options, message):
     settings = measured(*options)
     with pytest.raises(Refused, match=message):
         read_scan(ReconstructSettings(**settings))
+
+
+@pytest.mark.parametrize("options", [{"acceptance_degrees": 3}, {"diameter_mm": 30}])
+@pytest.mark.parametrize("unit", [None, "spect of activity"])
+def test_counts_of_any_hole_are_counts(tmp_path: Path, scan_of, options, unit):
+    """Of a cone that ends within the object, and of holes and pixels as wide as a hand. Also tried:
+    mu of 0.09 / mm, grids of one voxel and of 364 mm, pinholes of STIR, holes of 40 mm.
+    """
+    rig = dcspect80(pixels=4, columns=[2, 12])
+    counts = 1000 * Spect(GRID, rig, **options)(BLOCK)
+    given = (f"projector.{name}={value}" for name, value in options.items())
+    settings = scan_of(counts, rig, GRID, "method=osem", "projector=spect", *given)
+    settings["views"]["kind"] = "counts"
+    if unit is not None:
+        with h5py.File(tmp_path / "views.h5", "w") as file:
+            file.create_dataset("views", data=counts[0, 0].numpy()).attrs["unit"] = unit
+        settings["views"] |= {"path": str(tmp_path / "views.h5"), "kind": None}
+    scan = read_scan(ReconstructSettings(**settings))
+    assert scan.counts and scan.unit == "activity"

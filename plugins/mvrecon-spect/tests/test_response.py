@@ -1,6 +1,7 @@
 """Responses by the angle of incidence, and measured ones, against closed forms and Monte Carlo."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,39 @@ def test_an_oblique_ray_penetrates_the_rim_as_the_closed_form(degrees):
     assert math.sqrt(16 * u) == pytest.approx(radial * (1 + m), rel=5e-3)
 
 
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 19.5])
+@pytest.mark.parametrize(("opening", "diameter"), [(40.0, 1.0), (40.0, 2.3), (44.0, 0.5)])
+def test_angles_beyond_the_acceptance_change_no_efficiency(degrees, opening, diameter):
+    """Of detectors whose corners are at 50 degrees, far beyond the cone of the edge."""
+    rim, edge = math.tan(math.radians(opening / 2)) / 2.7, math.tan(math.radians(opening / 2))
+    angle = math.radians(degrees)
+    both = math.cos(angle) * (2 - math.tan(angle) ** 2 / edge**2)
+    response = {**CRYSTAL, "attenuation_per_mm": 100.0}
+    known = {"diameter": diameter, "response": response, "acceptance_degrees": 20.0}
+    thick = image(degrees, 150.0, **known, collimator_mu=2.7, opening_degrees=opening)
+    assert thick[0] / image(degrees, 150.0, **known)[0] == pytest.approx(
+        (diameter + rim * both) / diameter, rel=1e-3
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"opening_degrees": 50.0}, True),
+        ({"opening_degrees": 50.0, "acceptance_degrees": 30.0}, True),
+        ({"opening_degrees": 50.0, "acceptance_degrees": 25.0}, False),
+        ({"opening_degrees": 60.0}, False),
+        ({"opening_degrees": 50.0, "collimator_mu": None}, False),
+    ],
+    ids=str,
+)
+def test_voxels_beside_the_cone_of_the_edge_are_told(recwarn, options, told):
+    """Of a grid that is seen up to 28 degrees from the axis, before detectors up to 50 degrees."""
+    grid = Grid.centred(11, spacing=5.0, centre=(0, 0, 90))
+    Spect(grid, pinhole(51), **{"collimator_mu": 3.0, **options})
+    assert any("the edge blocks rays" in str(w.message) for w in recwarn) == told
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
 def test_a_measured_response_has_the_widths_of_its_table(tmp_path, encoding):
     """Rows from a known response; also at depths and angles between the rows. Excel marks UTF-8."""
@@ -159,6 +193,24 @@ def test_polynomials_have_fewer_terms_where_they_were_not_positive(tmp_path, row
     seen, thin = A(x)[0, 0, 0], sharp(x)[0, 0, 0]
     assert seen.isfinite().all() and seen.min() >= 0 and seen.sum() > 0.05 * thin.sum()
     assert response.detector[0] > 0 and seen.max() < 0.9 * thin.max()
+
+
+def test_widths_that_end_beside_the_detector_make_no_nan(tmp_path):
+    """Of voxels at up to 70 degrees, where the fitted variances are negative: gradients in poses,
+    the reference and the compiled kernels.
+    """
+    rows = "100,0,4,4\n60,0,5,5\n100,20,3.6,3.2\n60,20,4.6,4.2\n"
+    head = "depth_mm,angle_degrees,fwhm_radial_mm,fwhm_tangential_mm"
+    (tmp_path / "psf.csv").write_text(f"{head}\n{rows}")
+    grid, rig = Grid.centred(size=(10, 30, 30), spacing=5.0, centre=(0, 0, 60)), pinhole(24, 48.0)
+    options = {"blur": True, "response": tmp_path / "psf.csv"}
+    x = torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(0)).double()
+    y = Spect(grid, rig, 2.3, **options)(x)
+    moving = replace(rig, source=rig.source.clone().requires_grad_())
+    z = Spect(grid, moving, 2.3, **options)(x)
+    torch.testing.assert_close(z.detach(), y)
+    z.square().sum().backward()
+    assert moving.source.grad.isfinite().all() and moving.source.grad.any()
 
 
 @pytest.mark.parametrize("efficiency", [-1.0, 0.0, math.nan, math.inf])

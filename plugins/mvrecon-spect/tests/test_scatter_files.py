@@ -202,6 +202,16 @@ def test_windows_of_an_unknown_dose_are_refused(scans, tmp_path, unit):
         assert scan_with(known, "null", "old").unit == "activity"  # still readable
 
 
+def test_windows_beside_bad_pixels_have_whole_counts(tmp_path: Path, settings, recwarn):
+    """The bad ones, which are filled from their neighbours, are left out, not told as scaled."""
+    bad = np.zeros((16, 16), bool)
+    bad[5, 6] = bad[8, 8] = True
+    np.save(tmp_path / "bad.npy", bad)
+    window = "scatter={name: dew, lower: DIR/lower.npy}"
+    read_scan(settings(window, f"views.bad_pixels={tmp_path}/bad.npy"))
+    assert not [w for w in recwarn if "whole numbers" in str(w.message)]
+
+
 def test_scatter_is_binned_like_the_views(tmp_path: Path, settings):
     run = settings("scatter={name: given, path: DIR/map.npy}", "views.binning=2")
     run_reconstruction(run, tmp_path / "run")

@@ -127,7 +127,7 @@ def test_holes_of_one_detector_add_up_within_their_acceptance_angles():
     columns = [abs((k - 4.5) * 1.5 - 1.2) < 4.55 for k in range(10)]
     rows = [abs((k - 3.5) * 2.0 - 0.7) < 4.55 for k in range(8)]
     mask = torch.tensor(rows)[:, None] & torch.tensor(columns)
-    assert torch.equal(accepted(cameras_of(one), one.openings), mask.expand(4, 8, 10))
+    assert torch.equal(accepted(cameras_of(one), one.openings, one.pixel_mm), mask.expand(4, 8, 10))
     torch.testing.assert_close(operator_of(one, grid)(x), parts[0] * mask)
 
 
@@ -370,6 +370,14 @@ def test_the_operator_of_the_command_uses_sigma_and_acceptance_of_the_files(
     torch.testing.assert_close(
         read_scan(ReconstructSettings(**some)).operator()(x), A(x)[:, :, ::2]
     )
+    full = torch.ones_like(x)
+    for n in (2, 3, 4):  # joined pixels have all of their parts, or none
+        joined = compose(*options, f"views.binning={n}", config_name="reconstruct")
+        parts_of = mask.unflatten(1, (-1, n)).unflatten(0, (-1, n)).transpose(1, 2).flatten(2)
+        assert not torch.equal(parts_of.any(dim=2), parts_of.all(dim=2))
+        sums = A(full).unflatten(4, (-1, n)).unflatten(3, (-1, n)).sum(dim=(4, 6))
+        made = read_scan(ReconstructSettings(**joined)).operator()(full)
+        torch.testing.assert_close(made, sums * parts_of.all(dim=2), rtol=1e-4, atol=1e-6)
     with pytest.raises(ValueError, match="expected the cameras of this file"):
         stir_projector(grid, dcspect80(pixels=24), tmp_path / "scan" / "input.hs")
     # a measured response, which contains the detector's, in place of sigma
@@ -590,7 +598,7 @@ def test_counts_outside_the_acceptance_angles_are_ignored_with_a_warning(tmp_pat
     """They change no voxel: the volume is that of the same views without them."""
     system, _, _ = pack(tmp_path / "scan")
     views = read_stir(tmp_path / "scan" / "input.hs").counts
-    dark = ~accepted(cameras_of(system), system.openings)
+    dark = ~accepted(cameras_of(system), system.openings, system.pixel_mm)
     options = ("camera=stir_pinhole", "projector=stir_pinhole", "method=osem", "grid.spacing=1.5")
     options = (f"views.path={tmp_path}/scan/input.hs", *options, "grid.size=[16,14,12]")
     settings = compose(*options, "method.iterations=2", config_name="reconstruct")

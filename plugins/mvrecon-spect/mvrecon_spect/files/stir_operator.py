@@ -119,7 +119,7 @@ def _behind(
         intrinsic_mm=FWHM * system.detector.sigma_mm if blur and not table else 0.0,
         **shared,
     )
-    mask = accepted(cameras, openings)
+    mask = accepted(cameras, openings, system.pixel_mm)
     return A if mask.all() else Scaled(A, pixels=mask.double())
 
 

@@ -149,22 +149,31 @@ def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
     return from_world(cameras, world)
 
 
-def accepted(cameras: Cameras, openings: Sequence[Opening]) -> Bool[Tensor, "m v u"]:
-    """Pixels of each camera within the acceptance angles of its hole.
+def accepted(
+    cameras: Cameras, openings: Sequence[Opening], pixel_mm: Sequence[float]
+) -> Bool[Tensor, "m v u"]:
+    """Pixels of each camera within the acceptance angles of its hole: those of the file by their
+    centres, and joined ones whose parts all are.
 
     Args:
         cameras: cameras of `cameras_of`, with any pixels.
         openings: the hole of each.
+        pixel_mm: size of the file's pixels (v, u).
     """
     hole, pixel = cameras.rays()
     within = []
     for axis, along in enumerate((cameras.u, cameras.v)):
-        unit = F.normalize(along, dim=-1)[:, None, None]
-        angle = torch.atan2(((pixel - hole) * unit).sum(dim=-1), cameras.distance[:, None, None])
+        joined = (along.norm(dim=-1) / pixel_mm[1 - axis]).round().clamp_min(1)
+        inside = (joined - 1) / (2 * joined)  # from the middle to that of the outermost part
+        unit, reach = F.normalize(along, dim=-1), inside * along.norm(dim=-1)
+        place = ((pixel - hole) * unit[:, None, None]).sum(dim=-1)
         limits = [(one.axis_degrees[axis], one.acceptance_degrees[axis]) for one in openings]
-        tilt, half = angle.new_tensor(limits).T[..., None, None]
-        within.append((torch.rad2deg(angle) - tilt).abs() <= half + ROUNDING)
-    return within[0] & within[1]
+        tilt, half = place.new_tensor(limits).T[..., None, None]
+        for end in (-1, 1):
+            edge = place + end * reach[:, None, None]
+            angle = torch.atan2(edge, cameras.distance[:, None, None])
+            within.append((torch.rad2deg(angle) - tilt).abs() <= half + ROUNDING)
+    return torch.stack(within).all(dim=0)
 
 
 def system_of(

@@ -129,6 +129,9 @@ def footprints(record: Float[Tensor, " c"], index: Float[Tensor, "p 4"]) -> Voxe
     blur = (record[DETECTOR] @ powers + record[RADIAL] @ powers * tangents**2) * per_mm2
     squares = edges_of(record, centre, w) ** 2
     variance = squares.sum(dim=1) / 12 + images * record[HOLE][0] + blur
+    # a response's polynomials may be negative far beside the detector, where nothing is seen
+    seen = seen & (variance > 0).all(dim=0)
+    variance = torch.where(variance > 0, variance, 1.0)
     fourth = squares.square().sum(dim=1) / 120 + images**2 * record[HOLE][1]
     half, coefficients = profiles(variance, fourth)
     shift = (record[SHIFT] @ torch.stack([ones, t])) * tangents * record[PER_MM, None]

@@ -3,6 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.operators.operator import Composed, LinearOperator
 from mvrecon.operators.selection import ViewSelection
 
@@ -36,12 +37,24 @@ class Multiplexed(Composed):
         holes: number n of pinholes per detector.
 
     Raises:
-        ValueError: the number of pinholes is not a multiple of n.
+        ValueError: the number of pinholes is not a multiple of n, or consecutive ones have
+            detectors at different places.
     """
 
     def __init__(self, A: LinearOperator, holes: int):
         super().__init__(SummedHoles(A.range_shape, holes), A)
         self.holes = holes
+        rig: Cameras | None = getattr(A, "cameras", None)  # single bins have none
+        if rig is None:
+            return
+        centres = rig.detector_centre.detach().unflatten(0, (-1, holes))
+        apart = (centres - centres[:, :1]).norm(dim=-1)
+        if apart.max() > rig.u.norm(dim=1).max():
+            view = int(apart.flatten().argmax())
+            raise ValueError(
+                f"Expected {holes} consecutive pinholes with one detector, got that of pinhole "
+                f"{view} {apart.max():.3g} mm from that of {view - view % holes}"
+            )
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """Operator of a subset of detectors with their pinholes; subsets of pixels are computed

@@ -12,6 +12,7 @@ without attenuation and blur, a pixel also counts d_e^2 cos^4(phi) du dv / (16 l
 line integral of lambda, which thin rays sample.
 """
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -32,7 +33,7 @@ from mvrecon.operators.selection import check_support
 from mvrecon_spect.operators.footprints import Footprints, pixel_in_voxels
 from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.matter import CaseAttenuation, Matter, MuOption, attenuation_on
-from mvrecon_spect.operators.response import ResponseOption, response_of
+from mvrecon_spect.operators.response import ResponseOption, response_of, seen_points
 
 #: The methods: footprints of voxels, and the thin ray of each pixel.
 FOOTPRINTS, THIN = "footprints", "joseph"
@@ -83,7 +84,8 @@ class Spect(Scaled):
         shared: response, the hole's edge and the method, see `Shared`.
 
     Warns:
-        UserWarning: a grid without support extends behind pinholes, where they see nothing.
+        UserWarning: a grid without support extends behind pinholes, where they see nothing, or is
+            seen beside the cone of a hole's edge.
 
     Raises:
         ValueError: cameras whose detectors are not behind a pinhole, a pinhole inside the object or
@@ -91,6 +93,8 @@ class Spect(Scaled):
             detector, an `intrinsic_mm` or a response without blur, implausible attenuation in
             1/mm, or thin rays with blur, attenuation or pixels wider than a voxel's image.
     """
+
+    emission = True
 
     def __init__(
         self,
@@ -123,6 +127,7 @@ class Spect(Scaled):
             A, support = Drr(grid, cameras, method=method, **options), None
             weight = partial(hole.weight, cameras)
         warn_of_unseen(cameras, grid, options.get("support"))
+        warn_of_rim(hole, cameras, grid)
         super().__init__(OfCases(A) if attenuation else A, weight, support)
         self.diameter_mm, self.hole = diameter_mm, hole
         self.case_attenuation = attenuation
@@ -185,6 +190,8 @@ OBJECT = 0.8
 COARSE = 32
 #: Tolerance of the width of a pixel in voxels, and of the cosine between rows and columns.
 WIDER, SKEW = 1e-6, 0.01
+#: Degrees beyond a hole's edge without a warning.
+RIM_DEGREES = 1.0
 #: Options of a hole's edge, see `Hole`.
 EDGE = ("collimator_mu", "opening_degrees", "acceptance_degrees", "sensitivity")
 #: Options that determine the tables of an operator, which assignment would not change.
@@ -280,6 +287,23 @@ def warn_of_unseen(
         f"or give a support",
         stacklevel=1,  # one place, so that Python shows it once, whoever builds the operators
     )
+
+
+def warn_of_rim(hole: Hole, cameras: Cameras, grid: Grid) -> None:
+    """Warn about voxels seen at angles at which the edge of a hole would block rays.
+
+    Warns:
+        UserWarning: some are beyond half of the edge's opening angle.
+    """
+    least = math.cos(math.radians(hole.opening_degrees / 2 + RIM_DEGREES))
+    cosines = 1 - seen_points(cameras, grid).terms[:, 3] if hole.rim else torch.empty(0)
+    if (hole.acceptance_degrees or 90.0) > hole.opening_degrees / 2 and (cosines < least).any():
+        warnings.warn(
+            f"Voxels are seen at more than half of opening_degrees={hole.opening_degrees:g} from a "
+            f"pinhole's axis, where the edge blocks rays that are counted; set "
+            f"acceptance_degrees={hole.opening_degrees / 2:g}, or a smaller grid",
+            stacklevel=1,  # as in `warn_of_unseen`
+        )
 
 
 def sensitivity(cameras: Cameras, diameter_mm: float) -> Float[Tensor, "m v u"]:

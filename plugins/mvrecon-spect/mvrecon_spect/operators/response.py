@@ -146,7 +146,8 @@ def oblique(
     radially; those that pass it are lost. The rim of a knife edge is penetrated less at oblique
     incidence: by tan(a / 2) cos / mu tangentially and by (1 - tan^2 / tan^2(a / 2)) times this
     radially (Metzler & Accorsi, Phys. Med. Biol. 50 (2005) 5005). A thin hole has a round image at
-    any angle. Parts are fitted by polynomials in 1 - cos, to the corners of the detectors.
+    any angle. Parts are fitted by polynomials in 1 - cos, to the corners of the detectors or the
+    acceptance angle.
 
     Convention: the detector's plane of `Cameras` is at the mean depth of normal incidence.
 
@@ -163,7 +164,7 @@ def oblique(
     for name, value in (("crystal_mm", crystal_mm), ("attenuation_per_mm", attenuation_per_mm)):
         if not 0 < value < math.inf:
             raise ValueError(f"Expected a positive {name}, got {value}")
-    t = torch.linspace(0, 1 - _least_cosine(cameras), ANGLES, dtype=torch.float64)
+    t = torch.linspace(0, 1 - _least_cosine(cameras, hole), ANGLES, dtype=torch.float64)
     cosine = 1 - t
     tangent2 = 1 / cosine**2 - 1
     rate = attenuation_per_mm / cosine
@@ -199,11 +200,12 @@ def oblique(
     )
 
 
-def _least_cosine(cameras: Cameras) -> float:
-    """Cosine of the greatest angle between the axis and a pixel."""
+def _least_cosine(cameras: Cameras, hole: Hole) -> float:
+    """Cosine of the greatest angle between the axis and a pixel that the hole accepts."""
     start, end = cameras.rays()
     away = (end - start).detach().norm(dim=-1).amax(dim=(1, 2))
-    return min((cameras.distance.detach() / away).min().item(), 1 - 1e-6)
+    least = math.cos(math.radians(hole.acceptance_degrees or 90.0))
+    return min(max((cameras.distance.detach() / away).min().item(), least), 1 - 1e-6)
 
 
 def _powers(t: Float[Tensor, " n"], count: int) -> Float[Tensor, "n k"]:
@@ -300,7 +302,7 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
         _distinct(m, MIN_STEP * m.max().item()),
         _distinct(angle.abs(), MIN_STEP_DEGREES),
     )
-    terms, field = _terms(m, t), _field(cameras, grid)
+    terms, field = _terms(m, t), seen_points(cameras, grid)
     _warn_of_depths(path, m, field.terms[:, 1])
 
     def widths(orders: tuple[int, int]) -> tuple[Tensor, Tensor]:
@@ -337,7 +339,7 @@ def _distinct(values: Float[Tensor, " n"], least: float) -> int:
     return count
 
 
-class _Field(NamedTuple):
+class SeenPoints(NamedTuple):
     """Points of a grid in the field of a detector.
 
     Args:
@@ -359,7 +361,7 @@ class _Field(NamedTuple):
         return _powers(t, 3) @ coefficients.to(t)
 
 
-def _field(cameras: Cameras, grid: Grid) -> _Field:
+def seen_points(cameras: Cameras, grid: Grid) -> SeenPoints:
     """The points of a grid that a detector sees, one for each pinhole that images it."""
     axes = [torch.linspace(0, n - 1, GRID_POINTS, dtype=torch.float64) for n in grid.size]
     images = cameras.project(grid.to_world(torch.cartesian_prod(*axes)).to(cameras.source))
@@ -371,7 +373,7 @@ def _field(cameras: Cameras, grid: Grid) -> _Field:
     tangents = beam @ (steps / steps.norm(dim=-1, keepdim=True)).mT / length[..., None]
     m = (-length / images.detach()[..., 2])[seen]
     t = (1 - length / beam.norm(dim=-1))[seen]
-    return _Field(_terms(m, t), tangents[seen] ** 2)
+    return SeenPoints(_terms(m, t), tangents[seen] ** 2)
 
 
 def _warn_of_depths(path: Path, known: Float[Tensor, " n"], asked: Float[Tensor, " p"]) -> None:
