@@ -194,9 +194,9 @@ def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) ->
         )
         if few > max(MIN_SPARSE_SHARE * view_nrmse, 2 * many):
             return (
-                f"{method.name} of {len(scan.cameras)} views leaves {few:.2g} of views that fit this "
-                f"rig, and {many:.2g} of {DENSER_FACTOR} times as many: these are too few for it, "
-                f"and an iterative method such as sirt explains them better"
+                f"{method.name} of {len(scan.cameras)} views leaves {few:.2g} of views that fit "
+                f"this rig, and {many:.2g} of {DENSER_FACTOR} times as many: these are too few for "
+                f"it, and an iterative method such as sirt explains them better"
             )
     return ""
 

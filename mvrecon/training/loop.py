@@ -25,7 +25,7 @@ class WholeSteps(_TrainingEpochLoop):
         super().reset()
         if self.restarting:
             self._batches_that_stepped = self.global_step
-        progress = self.trainer.fit_loop.epoch_progress
+        progress: Any = self.trainer.fit_loop.epoch_progress
         for counts in (progress.total, progress.current):
             counts.ready = counts.started = counts.processed + 1
 
