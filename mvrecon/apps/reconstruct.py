@@ -205,7 +205,7 @@ def reconstruct(
         **outcome.row(),
         "percentiles_1_99": output.percentiles(outcome.volume),
         **run_method.emission(scan, outcome.volume, device),
-        "sanity_checks": sanity_checks.sanity_checks(scan, method.name, outcome, device, as_read),
+        "sanity_checks": sanity_checks.sanity_checks(scan, method, outcome, device, as_read),
         "left_out": run_method.left_out(scan, method, device) if left_out else None,
         **camera_row([cameras_of(alignment, {})]),
     }

@@ -22,7 +22,7 @@ from mvrecon.apps.rig_checks import (
     coarse_grid,
     noise_of,
 )
-from mvrecon.apps.run_method import Outcome
+from mvrecon.apps.run_method import Method, Outcome
 from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory, share_beside
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.attenuation import WATER
@@ -32,6 +32,7 @@ from mvrecon.geometry.grid import coarse
 from mvrecon.methods.classical.fdk import fbp, fdk
 from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.classical.sirt import sirt
+from mvrecon.methods.method import Solver
 from mvrecon.operators.operator import sees_integrals
 from mvrecon.report.metrics import nrmse
 
@@ -58,7 +59,7 @@ OPAQUE_LINE_INTEGRAL = 20.0
 
 def sanity_checks(
     scan: Scan,
-    method: str,
+    method: Method,
     outcome: Outcome,
     device: str = "cpu",
     as_read: MeasuredViews | ViewsInMemory | None = None,
@@ -70,14 +71,14 @@ def sanity_checks(
 
     Args:
         scan: the scan that was reconstructed.
-        method: name of the method.
+        method: the method, with its options.
         outcome: what the method made, with a volume in the unit of the views per mm.
         device: device that computes the comparison.
         as_read: the views before a correction, which leaves no whole counts; None: the scan's.
     """
     words: list[str] = []
     limit, view_nrmse = MAX_VIEW_NRMSE, outcome.view_nrmse
-    kind = getattr(METHODS.get(method), "data_kind", "integrals")
+    kind = getattr(METHODS.get(method.name), "data_kind", "integrals")
     if outcome.lost:
         words.append(
             f"lost views, zero everywhere: {', '.join(map(str, outcome.lost))} (from 0); "
@@ -112,7 +113,7 @@ def sanity_checks(
             words += _of_hot_voxels(outcome.volume)
     beside = _beside(seen) if seen and view_nrmse > limit else 0.0
     # filtered back-projection is right on a grid of a part of the object, which explains no views
-    part = beside > MIN_BESIDE and METHODS.get(method) in (fbp, fdk)
+    part = beside > MIN_BESIDE and METHODS.get(method.name) in (fbp, fdk)
     if view_nrmse > limit and not words and not part:
         cause = _cause(seen, method, view_nrmse, beside) if seen and kind != "counts" else ""
         words.append(
@@ -141,7 +142,7 @@ def _beside(seen: SomeViews) -> float:
     return share_beside(A, seen.first[None, None])
 
 
-def _cause(seen: SomeViews, method: str, view_nrmse: float, beside: float) -> str:
+def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) -> str:
     """Why a volume does not explain line integrals, where that is not the rig: their noise, an
     object that extends beyond the grid, a method that has not converged, or one that needs more
     views; else empty.
@@ -161,8 +162,8 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float, beside: float) -> st
             f"{beside:.0%} of the line integrals are those of rays outside the grid, which no "
             f"volume on it explains: is it as large as the object?"
         )
-    part = METHODS.get(method)
-    if not inspect.isfunction(part):
+    module = method.module
+    if not isinstance(module, Solver):
         return ""
     with suppress(ValueError), torch.no_grad(), warnings.catch_warnings():  # not on a circle
         warnings.simplefilter("ignore")  # the method has given its own
@@ -171,12 +172,12 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float, beside: float) -> st
         A = PROJECTORS.from_config(scan.projector, grid=grid, cameras=seen.cameras).to(device)
         x = sirt(A, seen.views, SEARCH_ITERATIONS, momentum=True)
         left = nrmse(A(x), seen.views)
-        if "iterations" in inspect.signature(part).parameters and (
+        if "iterations" in inspect.signature(module.solve).parameters and (
             left < min(MAX_VIEW_NRMSE, MAX_CONVERGED_SHARE * view_nrmse)
         ):
             return (
                 f"{SEARCH_ITERATIONS} iterations of sirt with momentum on a coarse grid leave only "
-                f"{left:.2g} of them: has {method} converged (method.iterations)?"
+                f"{left:.2g} of them: has {method.name} converged (method.iterations)?"
             )
         orbit = orbit_of(A.cameras, A.grid)
         step = (torch.remainder(orbit.angles.diff() + 180, 360) - 180).mean()
@@ -188,14 +189,14 @@ def _cause(seen: SomeViews, method: str, view_nrmse: float, beside: float) -> st
         }
         rig = replace(A.cameras, **dense)
         few, many = (
-            nrmse(B(part(B, B(x))), B(x))
+            nrmse(B(module(B(x), B).volume), B(x))
             for B in (A, PROJECTORS.from_config(scan.projector, grid=A.grid, cameras=rig))
         )
         if few > max(MIN_SPARSE_SHARE * view_nrmse, 2 * many):
             return (
-                f"{method} of {len(scan.cameras)} views leaves {few:.2g} of views that fit this "
-                f"rig, and {many:.2g} of {DENSER_FACTOR} times as many: these are too few for it, "
-                f"and an iterative method such as sirt explains them better"
+                f"{method.name} of {len(scan.cameras)} views leaves {few:.2g} of views that fit "
+                f"this rig, and {many:.2g} of {DENSER_FACTOR} times as many: these are too few for "
+                f"it, and an iterative method such as sirt explains them better"
             )
     return ""
 

@@ -160,15 +160,9 @@ class Registry:
     def _accepting(self, name: str, options: Iterable[str]) -> Callable[..., Any]:
         """Return a part, checking that it has these options."""
         part = self.get(name)
-        known: list[str] = []
-        for parameter in inspect.signature(part).parameters.values():
-            if parameter.kind is not parameter.VAR_KEYWORD:
-                known.append(parameter.name)
-            elif shared := getattr(parameter.annotation, "__args__", ()):  # Unpack[TypedDict]
-                known += shared[0].__annotations__
-            else:
-                return part
-        check_options(f"The {self.kind} {name!r}", options, known)
+        known, others = _options_of(part)
+        if not others:
+            check_options(f"The {self.kind} {name!r}", options, known)
         return part
 
     def takes(self, name: str, option: str) -> bool:
@@ -177,7 +171,7 @@ class Registry:
         Raises:
             LookupError: the name is unknown.
         """
-        return option in inspect.signature(self.get(name)).parameters
+        return option in _options_of(self.get(name))[0]
 
     def check(self, config: Mapping[str, Any]) -> None:
         """Check the mapping of `from_config` without building the part.
@@ -252,6 +246,12 @@ def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
     choices = list(known)
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def _options_of(part: Callable[..., Any]) -> tuple[Mapping[str, Any], bool]:
+    from mvrecon.core.signatures import options_of  # which imports this file
+
+    return options_of(part)
 
 
 def _where(part: Any) -> str:

@@ -513,11 +513,16 @@ class PerSample(Wrapped):
         return torch.cat([apply(A, one) for A, one in zip(self.operators, samples, strict=True)])
 
     def mu_map(self) -> Float[Tensor, "b d h w"] | None:
-        """The mu-maps of the samples."""
+        """The mu-maps of the samples, zero where one has none; None if none has one."""
         operators: Any = self.operators
         maps = [A.mu_map() for A in operators]
-        return None if any(mu is None for mu in maps) else torch.stack(maps)
+        some = next((mu for mu in maps if mu is not None), None)
+        if some is None:
+            return None
+        return torch.stack([torch.zeros_like(some) if mu is None else mu for mu in maps])
 
     def pixel_integral(self) -> PixelIntegral | None:
-        """That of the first sample; mu-maps do not change it."""
-        return self.A.pixel_integral()
+        """That of the first sample, if all have one."""
+        operators: Any = self.operators
+        found = [A.pixel_integral() for A in operators]
+        return None if any(one is None for one in found) else found[0]

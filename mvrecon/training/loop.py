@@ -19,10 +19,15 @@ class WholeSteps(_TrainingEpochLoop):
         return self.batch_progress.total.ready % self.trainer.accumulate_grad_batches != 0
 
     def reset(self) -> None:
-        """Number the logged steps of a resumed training like an uninterrupted one's."""
+        """Number the logged steps and the epochs of a resumed training like an uninterrupted one's:
+        Lightning does not count an epoch as begun that it begins after a break.
+        """
         super().reset()
         if self.restarting:
             self._batches_that_stepped = self.global_step
+        progress: Any = self.trainer.fit_loop.epoch_progress
+        for counts in (progress.total, progress.current):
+            counts.ready = counts.started = counts.processed + 1
 
     def advance(self, data_fetcher: Any) -> None:
         """Train on a batch; a training that stopped at the end of an epoch resumes after it.

@@ -65,7 +65,9 @@ class KeepLast(Checkpoint):
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         """Save if there is no validation, and before Lightning stops."""
-        unvalidated = trainer.is_last_batch and not sum(trainer.num_val_batches)
+        data: Any = trainer.datamodule  # pyrefly: ignore[missing-attribute]
+        validates = trainer.fit_loop.epoch_loop._should_check_val_epoch() and len(data.sets["val"])
+        unvalidated = trainer.is_last_batch and not validates
         if unvalidated or trainer.should_stop or trainer.received_sigterm:
             self._save(trainer)
 

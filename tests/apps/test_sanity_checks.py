@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvrecon.apps import rig_checks as module
-from mvrecon.apps.run_method import Outcome
+from mvrecon.apps.run_method import Method, Outcome
 from mvrecon.apps.sanity_checks import sanity_checks
 from mvrecon.apps.scan import Scan
 from mvrecon.core.parts import METHODS, PROJECTORS
@@ -56,9 +56,9 @@ def views():
     return Drr(GRID, RIG)(two_cubes())[0, 0]
 
 
-def checked(scan, method, view_nrmse, value=0.0, lost=()):
-    """Problems reported for a uniform volume with the given residual."""
-    volume = torch.full((2, 2, 2), value)
+def checked(scan, name, view_nrmse, value=0.0, lost=(), **options):
+    """Problems reported for a uniform volume of a method with the given residual."""
+    volume, method = torch.full((2, 2, 2), value), Method.of({"name": name, **options})
     return sanity_checks(scan, method, Outcome(volume, 0.0, None, view_nrmse, lost=[*lost]))
 
 
@@ -211,7 +211,8 @@ def test_few_counts_are_explained_within_their_noise(views, factor, level, monke
     volume = torch.ones(16, 16, 16)
     for value, hot in ((10.0, []), (200.0, ["single voxels reach 200 times"])):
         volume[3, 4, 5] = value
-        words = sanity_checks(scan, "osem", Outcome(volume, 0.0, None, noise, lost=[]))
+        outcome = Outcome(volume, 0.0, None, noise, lost=[])
+        words = sanity_checks(scan, Method.of({"name": "osem"}), outcome)
         assert [line[: len("single voxels reach 200 times")] for line in words] == hot
 
 
@@ -267,6 +268,26 @@ def test_few_views_for_fdk_are_not_taken_for_wrong_lengths(right_rig, count, sta
     assert len(words) == len(causes) and (figure > 0.25) == bool(causes)
     for line, cause in zip(words, causes, strict=True):
         assert [known for known in (FEW, LENGTHS) if known in line] == [cause]
+
+
+def test_the_method_is_judged_with_its_own_options(right_rig, monkeypatch):
+    """One with a needed option, which ended the command before it had written its results. Tried by
+    hand: finer, and a plugin's with an option by keyword alone.
+    """
+    used = []
+
+    def needy(A, views, level):
+        used.append(level)
+        return level * fdk(A, views, max_missing=1.0)
+
+    monkeypatch.setattr(METHODS, "_parts", {**METHODS._parts, "needy": needy})
+    rig = circular(5, 300.0, 450.0, {"pixels": [30, 32], "pixel_mm": 5.0})
+    A = Drr(GRID, rig)
+    views = A(two_cubes())
+    scan = Scan(InMemory(views[0, 0]), rig, GRID, {"name": "drr"})
+    left = nrmse(A(fdk(A, views, max_missing=1.0)), views)
+    (words,) = checked(scan, "needy", left, level=1.0)
+    assert FEW in words and used == [1.0, 1.0]
 
 
 @pytest.mark.parametrize("slices", [1, 12])

@@ -1,6 +1,7 @@
 """The registry reports errors, and a broken plugin affects only its users."""
 
 from importlib.metadata import EntryPoint
+from typing import TypedDict, Unpack
 
 import pytest
 
@@ -45,6 +46,29 @@ def test_a_part_is_built_from_its_name_and_options(cameras: Registry):
     assert cameras.from_config({"name": "ring", "radius": 5.0}, views=2) == (2, 5.0)
     assert cameras.build("dome", a=1.0) == {"a": 1.0}
     assert cameras.get("text")([1]) == "[1]"
+
+
+class Shared(TypedDict, total=False):
+    """Options that parts share."""
+
+    radius: float
+
+
+def arc(views: int, step: int = 1, /, **shared: "Unpack[Shared]") -> tuple[int, int, Shared]:
+    return views, step, shared
+
+
+@pytest.mark.parametrize("option", ["radios", "views", "step", "shared"])
+def test_options_of_unpacked_records_are_known_by_name(cameras: Registry, option: str):
+    """With annotations that are texts, as of `from __future__ import annotations`, any option was
+    taken; arguments by position alone are no options.
+    """
+    cameras.register("arc")(arc)
+    assert cameras.build("arc", 3, radius=5.0) == (3, 1, {"radius": 5.0})
+    assert cameras.takes("arc", "radius") and not cameras.takes("arc", option)
+    for act in (cameras.check, cameras.from_config):
+        with pytest.raises(TypeError, match=f"'arc' has no option '{option}'"):
+            act({"name": "arc", option: 1})
 
 
 def test_an_unknown_name_reports_the_nearest_and_all(cameras: Registry):

@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.parts import METHODS, ClassicalPart, OptionsOf
+from mvrecon.core.options import parts_in
+from mvrecon.core.parts import LISTED, METHODS, ClassicalPart, OptionsOf
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt
 from mvrecon.core.registry import check_options
 from mvrecon.geometry.grid import Grid
@@ -47,7 +48,7 @@ class CaseCache:
         self,
         make: Callable[[list[int]], Sequence[Tensor]],
         A: Projector,
-        options: Mapping[str, Any],
+        options: Any,
         views: Float[Tensor, "b 1 m v u"],
         support: Bool[Tensor, "b 1 d h w"] | None = None,
     ) -> list[Tensor]:
@@ -56,7 +57,7 @@ class CaseCache:
         Args:
             make: computes results [n ...] of n samples from their indices.
             A: the operator.
-            options: options of the computation.
+            options: options of the computation, and the functions that they name.
             views: measured views.
             support: support of each sample; None: all voxels.
         """
@@ -115,7 +116,11 @@ class ClassicalStart:
 
         if not training:
             return made(range(len(views)))[0]
-        return self._cases(made, geometry.A, self.start, views, geometry.support)[0]
+        # the functions of now: a notebook's cell may have been run again
+        parts = parts_in(self.start, ClassicalPart)
+        functions = [LISTED[kind].get(node["name"]) for _, kind, node in parts]
+        options = self.start, functions
+        return self._cases(made, geometry.A, options, views, geometry.support)[0]
 
     def _classical(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], samples: Sequence[int]

@@ -142,6 +142,20 @@ def test_a_batch_of_cached_and_new_cases_with_operators_of_their_own(name):
             torch.testing.assert_close(out, alone[batch], rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("outer", [{}, {"name": "finer"}])
+@torch.no_grad()
+def test_a_method_that_is_defined_again_computes_its_cases_anew(monkeypatch, outer):
+    """As by running a notebook's cell again, alone and within another method."""
+    monkeypatch.setattr(METHODS, "_parts", dict(METHODS._parts))
+    A = small_projector()
+    geometry, y = Geometry.of(A), A(blob(A))
+    METHODS._parts["cell"] = lambda A, views: A.T(views)
+    start = ClassicalStart({**outer, "method": {"name": "cell"}} if outer else {"name": "cell"})
+    first = start(geometry, y, training=True)
+    METHODS._parts["cell"] = lambda A, views: 2 * A.T(views)
+    torch.testing.assert_close(start(geometry, y, training=True), 2 * first)
+
+
 @torch.no_grad()
 def test_other_options_dtypes_and_supports_are_other_cases(made):
     A = small_projector()

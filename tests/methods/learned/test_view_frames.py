@@ -92,6 +92,20 @@ def test_attenuation_is_corrected_without_division_by_tiny_values():
     assert plain.emitted(density) is density
 
 
+def test_a_sample_without_attenuation_leaves_that_of_the_others():
+    """In any order: a patient's volume does not depend on the batch. Tried with `Spect(mu="case")`
+    and maps of zeros, by cross_view and mean_fusion: 0.07 and 0.7 % of the volume.
+    """
+    A = small_projector()
+    B = Attenuating(A, 0.03 * blob(A)[0, 0])
+    alone = ViewFrames.of(Geometry.of(B), 1, 3, 8).transmission
+    for each in ([A, B], [B, A]):
+        both = ViewFrames.of(Geometry.of(PerSample(each)), 1, 3, 8).transmission
+        expected = [alone if one is B else torch.ones_like(alone) for one in each]
+        torch.testing.assert_close(both, torch.cat(expected))
+    assert PerSample([A, A]).mu_map() is None
+
+
 def test_the_transmission_uses_the_operator_of_each_sample():
     A, mu = small_projector(), 0.03 * blob(small_projector())[0, 0]
     each = [Attenuating(A, factor * mu) for factor in (1.0, 2.0)]
