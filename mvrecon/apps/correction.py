@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.apps.progress import Bar
-from mvrecon.apps.scan import Scan, ViewsInMemory, share_beside
+from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
@@ -34,16 +34,17 @@ from mvrecon.methods.calibration.from_data import (
     unknowns,
 )
 from mvrecon.methods.calibration.hardening import Linearisation, fit_linearisation
-from mvrecon.methods.calibration.self_alignment import warn_unless_aligned
+from mvrecon.methods.calibration.self_alignment import (
+    MAX_BESIDE,
+    share_beside,
+    warn_unless_aligned,
+)
 from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.methods.method import Alignment
 from mvrecon.operators.operator import LinearOperator
 
 #: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
 MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
-#: Share of the line integrals outside the grid from which on the object extends beyond it: views of
-#: a ball are aligned on a grid that misses 0.001 of them, and no longer where it misses 0.016.
-MAX_BESIDE = 0.005
 #: Arrays of the views' size that a fit holds.
 HELD_ARRAYS = 8
 #: f(A, views) -> aligned views, and the errors of their cameras.
@@ -284,7 +285,7 @@ def _grid_about(scan: Scan, pixels: Float[Tensor, "1 1 m v u"]) -> Grid:
     A = PROJECTORS.from_config(
         scan.projector, grid=coarse(scan.grid, MAX_GRID_VOXELS), cameras=scan.cameras
     )
-    beside = share_beside(A.to(pixels.device), pixels)
+    beside = share_beside(A.to(pixels.device), pixels).item()
     return extended_to_field(scan.cameras, scan.grid) if beside > MAX_BESIDE else scan.grid
 
 

@@ -23,12 +23,13 @@ from mvrecon.apps.rig_checks import (
     noise_of,
 )
 from mvrecon.apps.run_method import Method, Outcome
-from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory, share_beside
+from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory
 from mvrecon.core.parts import METHODS, PROJECTORS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import coarse
+from mvrecon.methods.calibration.self_alignment import share_beside
 from mvrecon.methods.classical.fdk import fbp, fdk
 from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.classical.sirt import sirt
@@ -139,7 +140,7 @@ def _beside(seen: SomeViews) -> float:
     """The share of the first view's line integrals in pixels whose rays miss the scan's grid."""
     grid, cameras = seen.scan.grid, seen.scan.cameras[:1]
     A = PROJECTORS.from_config(seen.scan.projector, grid=grid, cameras=cameras)
-    return share_beside(A, seen.first[None, None])
+    return share_beside(A, seen.first[None, None]).item()
 
 
 def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) -> str:

@@ -279,13 +279,6 @@ def open_scan(
     return replace(scan, unit=unit.removesuffix(" * mm").rpartition(" of ")[2])
 
 
-def share_beside(A: LinearOperator, views: Float[Tensor, "1 1 m v u"]) -> float:
-    """The share of the line integrals in pixels whose rays miss an operator's grid, up to noise."""
-    reached = A(torch.ones(1, 1, *A.domain_shape, device=A.device)).to(views) > 0
-    whole = views.sum(dtype=torch.float64).item()
-    return (views * ~reached).sum(dtype=torch.float64).item() / whole if whole > 0 else 0.0
-
-
 def _warn_of_missing_mu(views: MeasuredViews) -> None:
     """Warn of attenuated counts without an attenuation map."""
     path, name = Path(views.options.path), (views.stack.unit or "").partition(" of ")[0]

@@ -28,6 +28,7 @@ from mvrecon.methods.calibration.from_data import (
     MAX_LEFT_OUT,
     OperatorOf,
     Problem,
+    derivatives,
     improved,
     unknowns,
 )
@@ -42,6 +43,9 @@ VOXELS, MAX_VIEWS = (48, 96, 192), 400
 CUTOFF = 0.5
 #: Conjugate gradients in each round, rounds, and the step in pixels after which they end.
 ITERATIONS, ROUNDS, MAX_FINAL_STEP = 8, 4, 0.02
+#: Groups of consecutive views whose spread is the standard error, as neighbours err alike, and
+#: standard errors in the uncertainty.
+GROUPS, STANDARD_ERRORS = 24, 2.5
 #: Uncertainty by the size of the voxels, relative to it: up to 0.08 was seen with 16 columns.
 VOXEL_SHARE = 0.04
 
@@ -73,8 +77,9 @@ def refined_axis(
     The shift ends with the last size of voxels at which it predicts held-out views of the slice
     better than without, and well: those of an empty slice have nothing but noise. Voxels are
     halved down to a pixel's image, however coarse the grid is, as they bias the shift by a part of
-    their size. The uncertainty is how much the last size changed it, and at least that part; that
-    part alone where a smaller size changed it no more.
+    their size. The uncertainty is how much the last size changed it, and at least that part and
+    `STANDARD_ERRORS` of the size where these are greatest, see `scatter`; these alone where a
+    smaller size changed it no more.
 
     Args:
         operator_of: the operator of a rig on a grid.
@@ -95,7 +100,7 @@ def refined_axis(
     rig, views = cameras[::every], views[:, :, ::every]
     sides = _sides(grid, orbit)
     wide, most = sides.max().item() / resolution(rig, orbit.centre), max(len(rig), VOXELS[0])
-    offset, uncertainty, least = 0.0, math.inf, math.inf
+    offset, uncertainty, least, noise = 0.0, math.inf, math.inf, 0.0
     for size in sorted({min(n, max(1, round(wide))) for n in VOXELS if n <= most}):
         box, pixels = _slice(grid, orbit, sides, size), wide / size
         rows, columns = max(1, min(round(pixels), rig.shape[0])), max(1, int(pixels / 2))
@@ -105,11 +110,13 @@ def refined_axis(
             break
         part = rig.cropped((first, first + rows), (0, last)).binned((rows, columns))
         y = avg_pool2d(views[0, :, :, first : first + rows, :last], (rows, columns))[None]
-        change = _change(partial(operator_of, box), part, y, min(1.0, CUTOFF * columns / pixels))
+        cutoff = min(1.0, CUTOFF * columns / pixels)
+        change, error = _change(partial(operator_of, box), part, y, cutoff)
         if change == 0:
             uncertainty = min(uncertainty, least)  # of the voxels before
             break
-        offset, least = offset + columns * change, VOXEL_SHARE * pixels
+        noise = max(noise, columns * error)  # smaller voxels fit more of it
+        offset, least = offset + columns * change, max(VOXEL_SHARE * pixels, noise)
         uncertainty = max(abs(columns * change), least)
         if abs(offset) > most_px:
             warnings.warn(
@@ -125,9 +132,9 @@ def refined_axis(
 
 def _change(
     operator_of: OperatorOf, cameras: Cameras, y: Float[Tensor, "1 1 m 1 u"], cutoff: float
-) -> float:
-    """The shift of the slice's detectors; 0 where it does not improve the prediction of held-out
-    views. Steps oscillate about it, so it is their mean.
+) -> Axis:
+    """The shift of the slice's detectors, and its uncertainty by noise; 0 where it does not improve
+    the prediction of held-out views. Steps oscillate about it, so it is their mean.
     """
     ramp = partial(RootRamp, cutoff=cutoff, device=y.device)
     shape, y = operator_of(cameras).domain_shape, ramp(y.shape[2:])(y)
@@ -142,7 +149,19 @@ def _change(
             break
     values = (values + last) / 2
     without, left_out = (problem.left_out(at, ITERATIONS) for at in (still, values))
-    return values[0, 0].item() if left_out < min(without, MAX_LEFT_OUT) else 0.0
+    if left_out >= min(without, MAX_LEFT_OUT):
+        return KEPT
+    A, r = problem.operator(values), problem.residual(values, x)
+    effect = derivatives(lambda moved: problem.operator(moved)(x), values)[None]
+    rest = effect - A(cgls(A, effect, ITERATIONS))  # what no volume explains
+    pulls = (rest * r).sum(dim=(0, 1, 3, 4))  # of each view
+    error = scatter(pulls) / rest.square().sum().item()
+    return Axis(values[0, 0].item(), STANDARD_ERRORS * error)
+
+
+def scatter(pulls: Float[Tensor, " m"]) -> float:
+    """The standard deviation of the sum of the views' contributions, by groups of neighbours."""
+    return torch.stack([part.sum() for part in pulls.tensor_split(GROUPS)]).norm().item()
 
 
 def _sides(grid: Grid, orbit: Orbit) -> Float[Tensor, "3"]:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.methods.calibration.axis import KEPT, Axis
+from mvrecon.methods.calibration.axis import KEPT, Axis, scatter
 from mvrecon.methods.calibration.from_data import MAX_LEFT_OUT
 from mvrecon.methods.classical.orbit import Orbit, fan_coordinate, orbit_of
 
@@ -31,8 +31,6 @@ MAX_STEP_DEVIATION, MIN_VIEWS = 0.02, 8
 LEAST_PX, STANDARD_ERRORS, MOST_PX = 0.02, 3.0, 0.1
 #: Rays about which the search compares, at even steps of views and columns; the fit takes all.
 SEARCHED = 2**17
-#: Groups of consecutive views whose spread is the standard error: neighbours err alike.
-GROUPS = 24
 
 
 class _Lines(NamedTuple):
@@ -140,8 +138,7 @@ def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Gr
             return KEPT
         change = -slopes.sum().item() / curvature
         best += max(-1.0, min(1.0, change))
-        spread = torch.stack([part.sum() for part in slopes.tensor_split(GROUPS)]).norm().item()
-        error = STANDARD_ERRORS * spread / curvature
+        error = STANDARD_ERRORS * scatter(slopes) / curvature
         step = FINE_STEP if error < FINE_ERROR else STEP
         least = misfits[2].sum().item()
     if abs(best) > reach or abs(change) > STEP or error > MOST_PX:

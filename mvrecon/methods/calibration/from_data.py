@@ -365,7 +365,9 @@ def calibrated(
     """Fit a rig to the measured views alone.
 
     Parameters that the views do not determine keep their nominal values; the nominal rig is kept if
-    it predicts held-out views best, or if the fitted one predicts them badly, as of few views.
+    it predicts held-out views best, or if the fitted one predicts them badly, as of few views. The
+    nominal rig is the result, with the fit's uncertainty, if they differ by less than that and it
+    predicts best.
     Blobs and blur scale with the grid's voxel. Coarse voxels are fast and robust: edges need not be
     resolved, but there should be about as many views as voxels across. The object must be inside
     the grid and inside all views. Empty views are left out: their own shifts are 0, their gains 1.
@@ -450,13 +452,17 @@ def calibrated(
     values = fit.values
     left_out = (problem.left_out(start, iterations), problem.left_out(values, iterations))
     if (values != start).any() and left_out[1] > min(left_out[0], MAX_LEFT_OUT):
-        warnings.warn(
-            f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
-            f"fitted one with {left_out[1]:.5g} (expected less, and at most {MAX_LEFT_OUT}): the "
-            f"nominal rig is kept",
-            stacklevel=3,
-        )
-        values, kept, uncertainty = start, [name for name in free if name not in known], {}
+        within = values.new_tensor([uncertainty.get(kind, 0.0) for kind in numbers.kinds])
+        # of a rig that is right, the fit finds as much, up to its uncertainty
+        if left_out[1] > MAX_LEFT_OUT or ((values - start).abs() > within).any():
+            warnings.warn(
+                f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
+                f"fitted one with {left_out[1]:.5g} (expected less, and at most {MAX_LEFT_OUT}): "
+                f"the nominal rig is kept",
+                stacklevel=3,
+            )
+            kept, uncertainty = [name for name in free if name not in known], {}
+        values = start
     single = [kind for name in free for kind in PER_VIEW_KINDS.get(name, ())]
     common = values.new_tensor([kind not in single for kind in every.kinds])
     whole = (values[0] * common).repeat(len(cameras), 1)

@@ -114,7 +114,7 @@ def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
 
 def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
     """Whether an object reaches the first or the last row of any group of views: a mean over a
-    block of their columns is above noise and above what air reads, the lowest mean of that row.
+    block of their columns is above noise and above what air reads there, see `_air_along`.
 
     Args:
         edges: edges of the views' columns, `edges_of(views.mT)`.
@@ -125,9 +125,22 @@ def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
     noise = noise / math.sqrt(edges.shape[1] // len(noise))  # the least number of views in a group
     # an estimate from sixteen pixels is somewhere half the noise by chance
     noise = torch.maximum(noise, noise.movedim(1, 0).flatten(1).median(dim=1).values[:, None, None])
-    lowest = ends.amin(dim=3, keepdim=True)
-    air = lowest.clamp_min(0) * ((lowest < MAX_AIR) & (lowest < MAX_AIR_SHARE * top))
+    air = _air_along(ends).clamp_min(0)
+    most = air.amax(dim=3, keepdim=True)
+    air = air * ((most < MAX_AIR) & (most < MAX_AIR_SHARE * top))
     return bool((ends - air > ROW_EDGE * top + ROW_DEVIATIONS * noise).any())
+
+
+def _air_along(ends: Float[Tensor, "g k n i"]) -> Float[Tensor, "g k n i"]:
+    """What air reads along rows: the straight line below the means of all blocks that is highest in
+    the middle, as a flat field may be off by another part at one side of the panel.
+    """
+    place = torch.arange(ends.shape[-1]).to(ends) - (ends.shape[-1] - 1) / 2
+    rise = ends[..., :, None] - ends[..., None, :]
+    slopes = divided(rise, place[:, None] - place).flatten(-2)  # one of them is zero
+    middle = (ends[..., None, :] - slopes[..., None] * place).amin(dim=-1)
+    height, best = middle.max(dim=-1, keepdim=True)
+    return height + slopes.gather(-1, best) * place
 
 
 def _grouped(x: Float[Tensor, "k m n i"]) -> Float[Tensor, "g k n i"]:

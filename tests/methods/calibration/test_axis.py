@@ -30,9 +30,9 @@ def rig_of(beam, arc, aside, rows=1):
     return parallel(120, panel, arc_degrees=arc)
 
 
-def views_of(rig, offset, photons=2e4):
+def views_of(rig, offset, photons=2e4, seed=0):
     views = RODS.integrals(*rig.shifted(torch.tensor([[offset, 0.0]])).rays()).float()
-    counts = torch.poisson(photons * (-views).exp(), torch.Generator().manual_seed(0))
+    counts = torch.poisson(photons * (-views).exp(), torch.Generator().manual_seed(seed))
     return -(counts.clamp_min(1) / photons).log()[None, None]
 
 
@@ -93,6 +93,19 @@ def test_the_uncertainty_of_few_columns_covers_their_noise(beam):
             assert axis.uncertainty < 0.3
             ratios.append(abs(axis.offset - 0.02) / axis.uncertainty)
     assert len(ratios) >= 4 and max(ratios) < 2
+
+
+@pytest.mark.parametrize("photons", [100, 300])
+@pytest.mark.parametrize(("beam", "arc"), [("parallel", 180.0), ("fan", 200.0)])
+def test_the_uncertainty_covers_the_noise_of_few_photons(beam, arc, photons):
+    """Within twice the uncertainty, where errors of 7 times were seen. Also tried: six seeds of
+    each, panels of 32 to 64 columns, 24 to 60 views; with 30 photons, up to 2.3 times.
+    """
+    rig, operator = rig_of(beam, arc, False), Radon if beam == "parallel" else Drr
+    for seed, offset in enumerate((1.25, -2.625)):
+        views = views_of(rig, offset, photons, seed)
+        axis = refined_axis(operator, rig, views, GRID, 4.0)
+        assert abs(axis.offset - offset) < 2 * axis.uncertainty
 
 
 def test_of_many_rows_those_in_the_plane_of_the_sources_tell_the_axis():

@@ -1,5 +1,6 @@
 """A misaligned rig comes back from its views alone, of an object that no grid can hold."""
 
+import warnings
 from dataclasses import replace
 from functools import cache, partial
 
@@ -95,6 +96,34 @@ def test_a_right_rig_stays_as_it_is():
     assert estimate.misalignment.offset_px.abs().max() < 0.05
     assert estimate.misalignment.tilt_degrees.abs().max() < 0.05
     assert torch.equal(estimate.gains, torch.ones(20).double())
+
+
+@pytest.mark.parametrize(
+    ("columns", "offset", "known"),
+    [(24, 0.0, 0.01), (32, 0.0, None), (64, 0.0, None), (64, 1.3, 1.3)],
+)
+def test_a_parameter_that_is_zero_is_found_as_zero_with_its_uncertainty(columns, offset, known):
+    """Without a warning, though the nominal rig predicts left-out views as well, and known: with
+    the axis that conjugate rays tell. Also tried: seven more sizes of pixels and voxels.
+    """
+    panel = {"pixels": [24, columns], "pixel_mm": 130.0 / columns}
+    rig = circular(30, 300.0, 450.0, panel)
+    sizes = torch.tensor([[34.0, 26, 30], [8, 8, 8], [6, 5, 7], [4, 4, 4]])
+    places = torch.tensor([[3.0, -5, 0], [-10, 4, 2], [16, -8, -3], [5, 12, 4]])
+    values = 0.02 * torch.tensor([1.0, 1, -0.5, 2])
+    body = Phantom((Solids("ellipsoid", places, torch.eye(3).expand(4, 3, 3), sizes, values),))
+    fine = rig.shifted(torch.tensor([[offset, 0.0]])).refined(2)
+    views = torch.nn.functional.avg_pool2d(body.integrals(*fine.rays()).float(), 2)[None, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit = calibrated(
+            partial(Drr, Grid.centred(24, spacing=3.5)),
+            rig,
+            views,
+            known={"offset_u": known} if known else {},
+        )
+    assert fit.kept == [] and (fit.misalignment.tilt_degrees.abs() < 0.05).all()
+    assert fit.uncertainty["tilt"] < 2
 
 
 def test_what_a_circle_does_not_determine_is_kept_and_what_it_determines_is_found():

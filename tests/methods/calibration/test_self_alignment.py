@@ -1,12 +1,14 @@
 """Wrong cameras are detected from the views alone, without displacing the object."""
 
 import math
+import warnings
 
 import pytest
 import torch
 
 from mvrecon.core.parts import PROJECTORS, SCENES
 from mvrecon.data.acquisition.disturbances import Disturbance, rig_errors
+from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.methods.calibration.alignment import least_deviations, translated
@@ -291,6 +293,35 @@ def test_truncated_views_are_aligned_only_where_this_improves_prediction(wrong):
     with pytest.warns(UserWarning, match="they are not aligned"):
         corrected, by = self_aligned(A, views)
     assert torch.equal(corrected, views) and not by.shift_px.any() and (by.gain == 1).all()
+
+
+@pytest.mark.parametrize("flat", [0.0, 0.03, 0.05 * torch.linspace(0, 1, 36), "noise"])
+@pytest.mark.parametrize(("size", "held"), [(28, True), (18, False), (13, False)])
+def test_a_grid_that_does_not_hold_the_object_is_said_where_its_views_are_not_aligned(
+    size, held, flat
+):
+    """An ellipsoid in closed form, of 26 voxels a side, misaligned in two views: flat fields that
+    are off and noise of 100 photons are no object beside the grid. Also tried: grids that miss
+    0.001 to 0.35 of the line integrals, right views, `method=aligned`.
+    """
+    rig = circular(12, 200.0, 400.0, {"pixels": [36, 36], "pixel_mm": 4.0})
+    radii = torch.tensor([[26.0, 22.0, 24.0]])
+    solid = Solids("ellipsoid", torch.zeros(1, 3), torch.eye(3)[None], radii, torch.tensor([0.03]))
+    offset = torch.zeros(12, 2, dtype=torch.float64)
+    offset[3], offset[7] = torch.tensor([1.2, -0.7]), torch.tensor([-0.9, 0.8])
+    start, end = rig.shifted(offset).rays()
+    views = Phantom((solid,)).integrals(start, end, rig.ray_extent).float()[None, None]
+    if flat == "noise":
+        counts = torch.poisson(100 * (-views).exp(), torch.Generator().manual_seed(0))
+        views = -(counts.clamp_min(1) / 100).log()
+    else:
+        views = views + flat
+    A = PROJECTORS.build("drr", grid=Grid.centred(size, spacing=2.0), cameras=rig)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        by = self_aligned(A, views).alignment
+    said = [line for line in caught if "extends beyond the grid" in str(line.message)]
+    assert by.shift_px.any() == held and len(said) == (not held)
 
 
 @pytest.mark.parametrize("fault", ["far", "counts", "narrow"])

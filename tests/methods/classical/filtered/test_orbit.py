@@ -184,13 +184,23 @@ def test_an_automatic_grid_warns_of_its_rows_where_the_object_extends_beyond_the
         (("ellipsoid", (60.0, 0.0, 20.0), (5.0, 5.0, 5.0), 3 * VALUE), False),
     ],
 )
-@pytest.mark.parametrize("flat", [0.0, 0.02, torch.linspace(0.05, 0.0, 90)[:, None, None]])
+@pytest.mark.parametrize(
+    "flat",
+    [
+        0.0,
+        0.02,
+        torch.linspace(0.05, 0.0, 90)[:, None, None],
+        torch.linspace(0.05, 0.0, 96),
+        torch.linspace(0.02, 0.07, 96),
+    ],
+)
 def test_a_part_beyond_the_rows_of_some_views_is_named_beside_a_body_within_them(
     part, beyond, flat
 ):
     """A small or weak part beside a body, which other views see within their rows; a flat
-    field that is off by 2 %, or that drifts by 5 %, is no such part, also of a body that absorbs
-    little. Also tried: parts at 30 to 60 mm, drifts that grow, that swing, and over rows.
+    field that is off by 2 %, or that drifts by 5 % over views or columns, is no such part, also of
+    a body that absorbs little. Also tried: parts at 30 to 60 mm, drifts that grow, that swing, and
+    over rows.
     """
     rig = circular(90, 400.0, 800.0, {"pixels": [48, 96], "pixel_mm": 5.0})
     shape, at, size, value = part
