@@ -549,6 +549,14 @@ def test_the_kind_of_a_scale_of_a_plot_is_no_scale(name, tmp_path):
         opened(area(path, name, scale_factor=[1.0, 2.0]))
 
 
+def test_one_frame_may_have_one_key(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frame"], file["key"], file["angles"] = grey()[0], 0, [0.0]
+    names = {"dataset": "frame", "image_key": "key", "angles": "angles"}
+    views = opened(tmp_path / "a.h5", kind="counts", **names)
+    assert np.array_equal(views.whole().views[0], grey()[0])
+
+
 def test_a_flat_field_of_another_name_is_listed_and_read(tmp_path):
     """As the SLS names those before and behind the views."""
     flat = np.full((2, ROWS, COLUMNS), FLAT, "u2")
