@@ -168,9 +168,11 @@ def test_a_number_that_is_the_name_of_a_file_is_named(folder: Path, monkeypatch)
             assert CommandLine.of([word]).overrides == [word]
     assert CommandLine.of(["camera.n_views=2020"]).overrides == ["camera.n_views=2020"]
     assert CommandLine.of(["views.path=2020"]).overrides == ["views.path='2020'"]
+    (folder / "true").mkdir()
+    assert CommandLine.of(["views.dark=true"]).overrides == ["views.dark='true'"]
     save(folder / NAME, {"views": {"path": "projections", "flat": 2020, "dark": "2020"}})
     for _ in range(2):
-        with pytest.warns(UserWarning, match="2020 is taken for a number.*'2020' in quotes is that"):
+        with pytest.warns(UserWarning, match="2020 is taken for a number.*'2020' in quotes"):
             told = CommandLine.of(expanded([f"scan={folder}"])).overrides
         assert told[1:] == ["views.flat=2020.0", f"views.dark={folder}/2020"]
         (folder / NAME).write_text("views: {path: projections, flat: 2020, dark: '2020'}")
