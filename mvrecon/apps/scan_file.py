@@ -9,6 +9,7 @@ found; `mvrecon-reconstruct scan=FOLDER`, or `scan=FILE`, takes it as if it were
 
 import os
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields
 from functools import partial
@@ -49,10 +50,13 @@ REFERS = re.compile(r"^[^#\n]*?(\$\{[^}\n]*\}?)", re.MULTILINE)
 class AsTyped(yaml.SafeLoader):
     """Reads numbers and dates as texts: names of files and data sets may look like these."""
 
-    yaml_implicit_resolvers = {
-        start: [pair for pair in pairs if not pair[0].endswith((":int", ":float", ":timestamp"))]
-        for start, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
+
+class Unquoted(str):
+    """What YAML takes for a number or a date, as it is typed."""
+
+
+for kind in ("int", "float", "timestamp"):
+    AsTyped.add_constructor(f"tag:yaml.org,2002:{kind}", lambda _, node: Unquoted(node.value))
 
 
 def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> None:
@@ -146,9 +150,18 @@ def _settings(file: Path) -> Iterator[str]:
     hdf5 = ending in VIEW_FILES.names() and VIEW_FILES.takes(ending, "angles")
 
     def from_file(path: str, marks: tuple) -> str | Path:
-        if path and (found := file_in(file.parent, path, FILE_MARK not in marks)) is not None:
+        found = file_in(file.parent, path, FILE_MARK not in marks) if path else None
+        number = NUMBER.fullmatch(path) and any(kind in marks for kind in (int, float))
+        if number and found and isinstance(path, Unquoted):
+            warnings.warn(
+                f"{file}: {path} is taken for a number, not for what is beside it by this name; "
+                f"'{path}' in quotes is that",
+                stacklevel=2,
+            )
+            return str(float(path))  # which is no name here, of which the command line would warn
+        if found is not None:
             return found
-        if not path or (NUMBER.fullmatch(path) and INSIDE_MARK in marks and FILE_MARK not in marks):
+        if number or not path:
             return path
         inside = INSIDE_MARK in marks and (hdf5 or views is None)
         named = inside and path[:1] not in (".", "~") and ":" not in path

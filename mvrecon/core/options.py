@@ -285,7 +285,8 @@ def with_paths(value: Any, type: Any, change: Callable[[str, tuple], str | Path]
     Args:
         value: data to be copied.
         type: its type.
-        change: f(path, marks): the path in its place; marks annotate its type, as `WEIGHTS_MARK`.
+        change: f(path, marks): the path in its place; marks annotate its type, as `WEIGHTS_MARK`,
+            or are the other types that it may have.
     """
 
     def changed(value: Any, type: Any) -> Any:
@@ -296,6 +297,6 @@ def with_paths(value: Any, type: Any, change: Callable[[str, tuple], str | Path]
         word = any(get_origin(m) is Literal and value in get_args(m) for m, _ in members)
         if word or any(isinstance(m, re.Pattern) and m.fullmatch(value) for m in marks[0]):
             return value
-        return change(value, marks[0])
+        return change(value, (*marks[0], *(member for member, _ in members)))
 
     return _mapped(value, type, "", changed, lambda s: getattr(s.mark, "targets", ""))

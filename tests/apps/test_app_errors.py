@@ -93,18 +93,20 @@ def test_an_option_that_an_experiment_sets_for_another_method_has_a_remedy(answe
 def test_warnings_that_differ_in_numbers_alone_are_one_line_and_counted(
     capsys: pytest.CaptureFixture[str],
 ):
-    """As those of training steps; other texts and other names are lines of their own."""
+    """As those of training steps; other texts and other names are lines of their own, also of files
+    that differ in their numbers, as of the jobs of a sweep.
+    """
     with one_line("mvrecon-train"):
         for number in range(5):
-            text = f"In {number} of 8 views {number / 3:.1f}% are cut"
+            text = f"In {number} of 8 views {number / 3:.1f}% are cut, [{number}, {number / 1e9}]"
             sys.stderr.write(warnings.formatwarning(text, UserWarning, "fdk.py", 3))
-        for name in ("a.tif", "b.tif"):
+        names = ("a.tif", "b.tif", "scan1/0/", "scan1/1/", "1.h5", "2.h5", "/1", "/2")
+        for name in names:
             sys.stderr.write(warnings.formatwarning(f"{name}: 7 keys", UserWarning, "t.py", 1))
     assert capsys.readouterr().err.splitlines() == [
-        "mvrecon-train: UserWarning: In 0 of 8 views 0.0% are cut",
-        "mvrecon-train: UserWarning: a.tif: 7 keys",
-        "mvrecon-train: UserWarning: b.tif: 7 keys",
-        "mvrecon-train: 4 further warnings repeat these with other numbers",
+        "mvrecon-train: UserWarning: In 0 of 8 views 0.0% are cut, [0, 0.0]",
+        *(f"mvrecon-train: UserWarning: {name}: 7 keys" for name in names),
+        "mvrecon-train: warnings that repeat these with other numbers: 4",
     ]
 
 

@@ -156,7 +156,9 @@ def test_paths_may_look_like_numbers_and_dates(folder: Path, monkeypatch, name: 
 
 @pytest.mark.filterwarnings("error")
 def test_a_number_that_is_the_name_of_a_file_is_named(folder: Path, monkeypatch):
-    """On a command line; in a description the file is taken. Also tried: exponents, files."""
+    """On a command line and in a description, where quotes make a name of it, also as `save`
+    writes them. Also tried: exponents, files, signs.
+    """
     monkeypatch.chdir(folder)
     (folder / "2020").mkdir()
     for key in ("views.flat", "views.dark"):
@@ -166,9 +168,36 @@ def test_a_number_that_is_the_name_of_a_file_is_named(folder: Path, monkeypatch)
             assert CommandLine.of([word]).overrides == [word]
     assert CommandLine.of(["camera.n_views=2020"]).overrides == ["camera.n_views=2020"]
     assert CommandLine.of(["views.path=2020"]).overrides == ["views.path='2020'"]
-    (folder / NAME).write_text("views: {path: projections, flat: 2020, dark: 2021}")
-    told = expanded([f"scan={folder}"])
-    assert told[1:] == [f"views.flat={folder}/2020", "views.dark=2021"]
+    (folder / "true").mkdir()
+    assert CommandLine.of(["views.dark=true"]).overrides == ["views.dark='true'"]
+    save(folder / NAME, {"views": {"path": "projections", "flat": 2020, "dark": "2020"}})
+    for _ in range(2):
+        with pytest.warns(UserWarning, match="2020 is taken for a number.*'2020' in quotes"):
+            told = CommandLine.of(expanded([f"scan={folder}"])).overrides
+        assert told[1:] == ["views.flat=2020.0", f"views.dark={folder}/2020"]
+        (folder / NAME).write_text("views: {path: projections, flat: 2020, dark: '2020'}")
+    (folder / NAME).write_text("views: {path: projections, flat: 2021, dark: '5e3'}")
+    assert expanded([f"scan={folder}"])[1:] == ["views.flat=2021", "views.dark=5e3"]
+
+
+@pytest.mark.parametrize("mu", [0.015, 0, 1e-05, "0.5", "measured", "mu.mha"])
+def test_numbers_of_options_that_may_be_paths_are_numbers(folder: Path, monkeypatch, mu):
+    """Attenuation of the projector, as typed and as `save` writes it; only a file's own name is a
+    path. Also tried: flat and dark fields, a list of angles.
+    """
+    pytest.importorskip("mvrecon_spect")
+    monkeypatch.chdir(folder)
+    for name in ("0.5", "mu.mha"):
+        (folder / name).touch()
+    expected = str(folder / mu) if mu in ("0.5", "mu.mha") else mu
+    text = f"projector: {{name: spect, mu: {mu!r}}}"
+    for write in (
+        lambda: (folder / NAME).write_text(text),
+        lambda: save(folder / NAME, {"projector": {"name": "spect", "mu": mu}}),
+    ):
+        write()
+        (_, told) = OverridesParser.create().parse_overrides(expanded([f"scan={folder}"]))
+        assert told.value() == expected
 
 
 @pytest.mark.parametrize("name", ["a b (c)", "a,b", "x=1", "[0]", "it's", "a#b", "ä", "{x}", "%$!"])

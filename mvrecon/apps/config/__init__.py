@@ -188,17 +188,17 @@ def prepared(arguments: Sequence[str], app: str, record: type | None) -> Command
             or none of it; an experiment of another app.
         PermissionError, Refused, FileNotFoundError: see `guard.store_foreign`.
     """
+    prepare_hydra()
+    settings = fields(record) if record else ()
+    sections = [setting.name for setting in settings if is_section(setting.type)]
+    tables = [setting.name for setting in settings if has_entries(setting.type)]
+    command = CommandLine.of(arguments, sections, texts_of(record) if record else (), tables)
     for before, word in pairwise(["", *arguments]):
         if not (SETTING.match(word) or before in FLAGS_OF_WORDS):
             raise LookupError(
                 f"Expected settings as key=value, such as {example_of(app)}, got {word!r}; --help "
                 f"lists them"
             )
-    prepare_hydra()
-    settings = fields(record) if record else ()
-    sections = [setting.name for setting in settings if is_section(setting.type)]
-    tables = [setting.name for setting in settings if has_entries(setting.type)]
-    command = CommandLine.of(arguments, sections, texts_of(record) if record else (), tables)
     guard.store_foreign(map(Path, command.folders), groups(), choice_file)
     typed = OverridesParser.create().parse_overrides(command.overrides)
     store_parts()

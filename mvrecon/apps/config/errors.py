@@ -34,6 +34,9 @@ PROGRAM_FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 #: What OmegaConf adds to its messages for programmers.
 OMEGACONF_DETAILS = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
+#: A number in a sentence; digits in names, such as those of files, tell what it is about.
+NUMBER = re.compile(r"[^\w\s/\\]*\d[\d.,:e+x-]*[^\w\s/\\]*")
+
 #: What installs choices: beginnings of their names, and the argument of pip install.
 INSTALLED_BY = {
     "'mvrecon[sweep]'": ("hydra/launcher/joblib", "hydra/sweeper/optuna"),
@@ -58,11 +61,11 @@ def one_line(app: str) -> Iterator[None]:
         SystemExit: in place of the error, unless HYDRA_FULL_ERROR=1 asks for its traceback.
     """
     traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
-    given: Counter[str] = Counter()
+    given: Counter[tuple[str, ...]] = Counter()
 
     def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> str:
         text = f"{app}: {category.__name__}: {message}\n"
-        kind = re.sub(r"\d+", "", text)
+        kind = tuple(word for word in text.split() if not NUMBER.fullmatch(word))
         given[kind] += 1
         return text if given[kind] == 1 else ""
 
@@ -89,7 +92,7 @@ def one_line(app: str) -> Iterator[None]:
             os.environ[FULL_ERROR] = traceback_asked
         warnings.formatwarning = shown
         if more := given.total() - len(given):
-            sys.stderr.write(f"{app}: {more} further warnings repeat these with other numbers\n")
+            sys.stderr.write(f"{app}: warnings that repeat these with other numbers: {more}\n")
 
 
 class TaskFailed(BaseException):

@@ -29,7 +29,6 @@ from mvrecon.core.signatures import alternatives, describe, describe_section
 GRAMMAR_CHARACTERS = set("=,;()[]{}' ")
 #: Hydra's own settings that are texts.
 HYDRA_TEXTS = ("hydra.run.dir", "hydra.sweep.dir", "hydra.sweep.subdir", "hydra.job.name")
-NUMBERS = {int, float, bool}
 #: Arguments that ask for a sweep.
 MULTIRUN = {"-m", "--multirun", "hydra.mode=MULTIRUN"}
 #: Texts in quotes, or single characters.
@@ -186,7 +185,8 @@ def in_grammar(key: str, value: str, names: Collection[str] = (), sweeps: bool =
     if is_name:
         return quoted(value)
     if _exists(value) and _is_text(key):
-        if not (numbers := [members for members in _members(key) if NUMBERS & members]):
+        kinds = {bool} if isinstance(plain, bool) else {int, float}
+        if not (numbers := [members for members in _members(key) if kinds & members]):
             return quoted(value)
         if any(Path in members for members in numbers):
             warnings.warn(

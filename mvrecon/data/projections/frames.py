@@ -12,6 +12,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.dicom_image import same
 from mvrecon.data.linked import Place, beside, check_around, followed, numbers_at
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
@@ -57,7 +58,6 @@ class Frames:
             self.shape = (1,) * (3 - stored.ndim) + stored.shape
             self.dtype = stored.dtype
             check_attributes(place.path, stored, ("units", *REGION))
-            self.region = {name: numbers_at(place, name, EXPECTED) for name in REGION}
             check_around(place, EXPECTED)
             if not stored.is_virtual:
                 self.parts = [Segment(place, 0, self.shape[0])]
@@ -69,6 +69,16 @@ class Frames:
                 f"{place}: expected parts with all {self.shape[0]} frames, got {ends[-1]}"
             )
         self._ends = ends.tolist()
+        self.region = {name: self._common(name) for name in REGION}
+
+    def _common(self, name: str) -> np.ndarray | None:
+        """An attribute of the data set, and of those of its parts; None if they have none."""
+        places = dict.fromkeys([self.place, *(part.place for part in self.parts)])
+        stated = [numbers_at(place, name, EXPECTED) for place in places]
+        known = [numbers for numbers in stated if numbers is not None]
+        if other := [numbers for numbers in known if not same(numbers, known[0])]:
+            raise Refused(f"{self.place}: expected one {name}, got {known[0]} and {other[0]}")
+        return known[0] if known else None
 
     def _part(self, source: Any, folder: Path) -> Segment:
         """A part of a virtual data set, which follows the part before it."""

@@ -383,7 +383,7 @@ class _Layout(NamedTuple):
         if self.sinogram:
             raise Refused(f"{self.key}: expected no keys of sinograms, got some")
         stored = values_at(self.key, EXPECTED)
-        if (keys := stored.ravel()).shape != (count,) or max(stored.shape) < count:
+        if (keys := stored.ravel()).shape != (count,) or max(stored.shape, default=1) < count:
             raise Refused(
                 f"{self.key}: expected a key for each of {count} frames, got {stored.shape}"
             )

@@ -5,7 +5,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from decimal import Decimal
-from itertools import product
+from itertools import product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -162,12 +162,14 @@ def _move_signs(parts: Sequence[list[str]]) -> None:
 
 
 def _counted(pattern: str, stems: Sequence[str]) -> bool:
-    """Whether what matches a pattern of decimals in names are pairs of integers: after "1.9" comes
-    "1.10", which is the smaller decimal.
+    """Whether what matches a pattern of decimals in names, at one of its places, are pairs of
+    integers: after "1.9" comes "1.10", which is the smaller decimal.
     """
-    places = [re.split("[.,]", text)[1] for stem in stems for text in re.findall(pattern, stem)]
-    ends = any(len(part) > 1 and part.endswith("0") for part in places)
-    return ends and len({*map(len, places)}) > 1
+    for column in zip_longest(*(re.findall(pattern, stem) for stem in stems)):
+        places = [re.split("[.,]", text)[1] for text in column if text]
+        if len({*map(len, places)}) > 1 and any(re.fullmatch(".+0", part) for part in places):
+            return True
+    return False
 
 
 def _by_one(column: Sequence[Any]) -> bool:

@@ -335,6 +335,7 @@ BOTH = [
     "%x-offset (mm) := 3.0",
     "gain corrected := 1",
     "log scale := 1",
+    "log10 scale := 1",
     "%data offset in bytes := 0",
     "%imagedata byte order := LITTLEENDIAN",
     "%number format := signed integer",

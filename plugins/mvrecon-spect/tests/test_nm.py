@@ -39,7 +39,7 @@ def test_heads_without_a_start_angle_are_asked_for_it(tmp_path: Path):
     """Two heads of a rotation with a start angle: each head's own is needed, and neither where the
     rotation has none, either. Heads may state the same angle; one head takes the rotation's. Of
     several rotations, each with a start angle, those of the heads are unknown, but where each head
-    has a rotation of its own that starts at its angle.
+    has a rotation of its own that starts at its angle. A rotation without views is none.
     """
     from pydicom.dataset import Dataset
 
@@ -76,6 +76,12 @@ def test_heads_without_a_start_angle_are_asked_for_it(tmp_path: Path):
     each["DetectorVector"] = each["RotationVector"]
     own = read_nm(study(tmp_path / "g.dcm", **each, **heads(10.0, 190.0), **turns(10.0, -170.0)))
     assert [view.angle_degrees for view in own.views] == [10.0, 340.0, 310.0, 190.0, 160.0, 130.0]
+    bare = read_nm(study(tmp_path / "i.dcm", **each, **heads(None, None), **turns(10.0, -170.0)))
+    assert [view[3:] for view in bare.views] == [view[3:] for view in own.views]
+    with pytest.raises(ValueError, match=r"StartAngle of each of the 2 .*detector 1, 2:"):
+        read_nm(study(tmp_path / "j.dcm", **each, **heads(None, None), **turns(10.0, 370.0)))
+    unused = read_nm(study(tmp_path / "k.dcm", **heads(10.0, 190.0), **turns(10.0, 100.0)))
+    assert [view.angle_degrees for view in unused.views] == [view[3] for view in own.views]
     for starts in ((10.0, 10.0), (190.0, 10.0)):
         with pytest.raises(ValueError, match="got 2 with a StartAngle each"):
             read_nm(study(tmp_path / "h.dcm", **each, **heads(10.0, 190.0), **turns(*starts)))

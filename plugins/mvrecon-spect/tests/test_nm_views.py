@@ -180,6 +180,11 @@ def test_what_a_phase_does_not_state_is_unknown_or_none(tmp_path: Path):
     times = ("PhaseVector", "TimeSliceVector")
     path = in_time(tmp_path / "c.dcm", times, PhaseInformationSequence=bare)
     assert [frame.start_s for frame, _ in read_frames(path)] == [0, 10, 20, 30, 40, 100]
+    late = in_time(tmp_path / "e.dcm", times, PhaseInformationSequence=bare[:1] * 2 + bare[1:])
+    dataset = pydicom.dcmread(late)
+    dataset.PhaseVector = [{1: 1, 2: 3}[number] for number in dataset.PhaseVector]
+    dataset.save_as(late)  # without frames of phase 2, of which no number is stated
+    assert [frame.start_s for frame, _ in read_frames(late)] == [0, 10, 20, 30, None, None]
     still = [item(pydicom.Dataset, ActualFrameDuration=0, NumberOfFramesInPhase=1)]
     stack = open_projections(
         study(tmp_path / "d.dcm", PhaseInformationSequence=still), dataset="window1"

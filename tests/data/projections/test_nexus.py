@@ -522,6 +522,22 @@ def test_views_and_fields_of_one_part_of_the_detector(part, tmp_path):
         opened(path, flat=f"{other}:/exchange/data_white")
 
 
+def test_virtual_frames_have_the_part_of_the_detector_of_their_files(tmp_path):
+    """As areaDetector writes raw files, and a beamline virtual frames of them."""
+    path, parts = virtual(tmp_path / "a.nxs"), tmp_path / "parts.h5"
+    with h5py.File(parts) as file:
+        names = [*file]
+    for name in names:
+        area(parts, name, **detector((320, 512)))
+    assert np.allclose(opened(path).whole().views, integrals(), atol=1e-6)
+    other = area(exchange(tmp_path / "b.h5"), "exchange/data_white", **detector((320, 0)))
+    with pytest.raises(Refused, match=r"flat field with the NDArrayDimOffset \[320 512\] of the"):
+        opened(path, flat=f"{other}:/exchange/data_white")
+    area(parts, names[-1], **detector((320, 0)))
+    with pytest.raises(Refused, match="data: expected one NDArrayDimOffset, got"):
+        opened(path)
+
+
 @pytest.mark.parametrize("name", ["/", "entry", "entry/sample", "entry/instrument/detector/data"])
 def test_the_kind_of_a_scale_of_a_plot_is_no_scale(name, tmp_path):
     """As nxtomo writes it for silx. Neutral numbers of each axis change nothing; others do."""
@@ -531,6 +547,14 @@ def test_the_kind_of_a_scale_of_a_plot_is_no_scale(name, tmp_path):
     assert np.allclose(opened(path).whole().views, integrals(), atol=1e-6)
     with pytest.raises(Refused, match=r"scale_factor.*\[1.0, 2.0\]"):
         opened(area(path, name, scale_factor=[1.0, 2.0]))
+
+
+def test_one_frame_may_have_one_key(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["frame"], file["key"], file["angles"] = grey()[0], 0, [0.0]
+    names = {"dataset": "frame", "image_key": "key", "angles": "angles"}
+    views = opened(tmp_path / "a.h5", kind="counts", **names)
+    assert np.array_equal(views.whole().views[0], grey()[0])
 
 
 def test_a_flat_field_of_another_name_is_listed_and_read(tmp_path):

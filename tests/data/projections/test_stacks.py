@@ -191,6 +191,7 @@ def test_decimals_in_names_decide_the_order(tmp_path):
         ["1.2.9", "1.2.10", "1.2.11"],
         ["p_.25", "p_.5", "p_.75"],
         ["p_8.5", "p_9.5", "p_10.5"],
+        [f"p_{k / 2:.1f}_{k / 4:.2f}" for k in range(5)],  # of several places each
         [f"{row}.{k}" for row in (1, 2, 3) for k in range(1, 10)],  # a table: no 2.0 is missing
         [f"a{row}.{k} b" for row in (0, 1) for k in range(3)],
         [f"{row}.{k:02}" for row in (9, 10) for k in range(1, 12)],

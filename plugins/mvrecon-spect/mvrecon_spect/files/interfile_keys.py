@@ -204,7 +204,7 @@ EFFECT = re.compile(
     r"dimensions)\b"
 )
 #: Values of such a key that change nothing, by its words: 1 of slopes, 0 of offsets.
-EFFECTS = {EFFECT.pattern: None, **keys.EFFECTS, r"\b(log|power)\b|correct": None}
+EFFECTS = {EFFECT.pattern: None, **keys.EFFECTS, r"\blog|\bpower|correct": None}
 #: Similarity of an unknown key to one of the tables, by `difflib`, from which it may be a slip.
 SLIP = 0.9
 #: Values of an unknown key that has no effect.

@@ -333,15 +333,14 @@ def _window(dataset: Any, index: int) -> EnergyWindow:
 
 
 def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
-    """Raise if several detectors of a rotation would get the same angles because only the rotation
-    states a start angle, or each of several.
+    """Raise if several detectors would get the same angles because only rotations state a start
+    angle, or each of several.
     """
-    turns = sorted({view[1] for view in views})
-    for turn in turns:
-        detectors = sorted({view[0] for view in views if view[1] == turn})
-        start = _start(dataset, "RotationInformationSequence", turn)
-        if start is None:
-            continue
+    turns = {view[1] for view in views}
+    starts = {n: _start(dataset, "RotationInformationSequence", n) for n in sorted(turns)}
+    for start in (angle for angle in starts.values() if angle is not None):
+        alike = {n for n, a in starts.items() if a is not None and _alike("StartAngle", a, start)}
+        detectors = sorted({view[0] for view in views if view[1] in alike})
         own = [_start(dataset, "DetectorInformationSequence", number) for number in detectors]
         if None in own and len(detectors) > 1:
             without = [n for n, angle in zip(detectors, own, strict=True) if angle is None]
@@ -351,7 +350,7 @@ def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]
                 f"{start}, the heads would all have the same angles; set it in "
                 f"DetectorInformationSequence"
             )
-        elsewhere = {view[0] for view in views if view[1] != turn}
+        elsewhere = {view[0] for view in views if view[1] not in alike}
         only = {angle for n, angle in zip(detectors, own, strict=True) if n not in elsewhere}
         agrees = all(_alike("StartAngle", angle, start) for angle in only - {None})
         if len(turns) > 1 and (len(set(own)) > 1 or not agrees):
@@ -439,7 +438,7 @@ def _view(dataset: Any, key: tuple[int, int, int], views: Sequence[tuple[int, in
     detector, rotation, number = key
     count = max(view[2] for view in views if view[:2] == key[:2])
     own = _item(dataset, "DetectorInformationSequence", detector)
-    turns = dataset.get("RotationInformationSequence") or []
+    turns = {view[1] for view in views}
     turn = _item(dataset, "RotationInformationSequence", rotation)
     count = int(_number("NumberOfFramesInRotation", turn, 0, 1) or count)
     first, second = (own, turn) if len(turns) < 2 else (turn, own)
@@ -478,7 +477,8 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
             if 0 < count < len(pieces):
                 raise ValueError(f"NumberOfFramesInPhase is {count:g}, got {len(pieces)} slices")
             before = piece - min(pieces) if number == phase else count or len(pieces)
-            if start is None or (duration is None and before):
+            unknown = duration is None if before else number < phase
+            if start is None or unknown:
                 start = None
             else:
                 start += (delay + before * pause) / 1000 + before * (duration or 0.0)
