@@ -47,7 +47,7 @@ def view(
 
     path = from_home(volume)
     place = from_home(out or f"{name_of(path)}.html").absolute()
-    check_writable(place)
+    check_writable(place, [from_home(one) for one in (volume, cameras) if one is not None])
     rig = None if cameras is None else from_file(from_home(cameras))
     values, grid = read_volume(path)
     text = page(values, grid, rig, window, first, name_of(path))

@@ -5,7 +5,8 @@ Examples:
     mvrecon-warmup
     NUMBA_CACHE_DIR=kernels mvrecon-warmup
 
-Compiled kernels are kept beside the code, or in the folder NUMBA_CACHE_DIR.
+Compiled kernels are kept in the folder NUMBA_CACHE_DIR, else beside the code, else in the user's
+cache.
 """
 
 import argparse
@@ -81,7 +82,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seconds = warm_up()
         from mvrecon.kernels.compiling import kept_in
 
-        sys.stdout.write(f"kernels are ready after {seconds:.0f} s, kept in {kept_in()}\n")
+        kept = f"kept in {folder}" if (folder := kept_in()) else "and are not kept"
+        sys.stdout.write(f"kernels are ready after {seconds:.0f} s, {kept}\n")
     return 0
 
 

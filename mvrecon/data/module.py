@@ -279,7 +279,8 @@ class SceneData(L.LightningDataModule):
         scene, store = self.scenes[key], None
         if self.loading.cache is not None:
             digests = self.digests(key)
-            parts: list[Any] = [type(scene)]
+            # a factory may be of a plugin, and what it builds of mvrecon
+            parts: list[Any] = [type(scene), SCENES.get(self._settings[key]["name"])]
             if self.projector is not None:
                 parts.append(PROJECTORS.get(self.projector["name"]))
             made_of = {

@@ -8,7 +8,7 @@ from contextlib import suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from numba import config, extending, njit
 from numba.core.caching import FunctionCache, NullCache
@@ -71,9 +71,12 @@ class Kept(FunctionCache):
 
     warned = False
     announced = False
+    #: The folders of all loops' machine code, which numba chooses.
+    folders: ClassVar[set[str]] = set()
 
     def __init__(self, loop: Callable[..., Any]):
         super().__init__(loop)
+        Kept.folders.add(self.cache_path)
         # numba's own stamp covers the loop's file, but not functions that it calls, here or in a
         # plugin
         self._cache_file._source_stamp = SOURCES + digest(Path(loop.__code__.co_filename).parent)
@@ -138,8 +141,6 @@ def compiled(loop: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-def kept_in() -> Path:
-    """The folder of numba's machine code: the environment variable NUMBA_CACHE_DIR, else beside the
-    code.
-    """
-    return Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parent)
+def kept_in() -> str | None:
+    """The folder that contains all machine code; None if none can be written."""
+    return os.path.commonpath(Kept.folders) if Kept.folders else None

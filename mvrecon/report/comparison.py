@@ -99,15 +99,20 @@ def read(places: Iterable[str | Path]) -> list[Row]:
 
 def rows_of(table: Results, run: str, folder: Path) -> Iterator[Row]:
     """The methods of a result table, under a run's name."""
-    settings = _settings(folder)
+    told = {"test_scene": table["scene"]} if "scene" in table else {}
+    settings = {**_settings(folder), **_by_name(told)}
     measured = {k: v for k, v in settings.items() if k.split(".")[0] in SCENE_SETTINGS}
+    truths = tuple((_number(mean), _number(rms)) for mean, rms in table.get("truths", ()))
+    of_scenes = [table["scenes"], truths or table["scenes"]]
     for label, row in table["methods"].items():
         figures = {key: tuple(map(_number, row[key]["values"])) for key in COMPARED_FIGURES}
+        if (lengths := {*map(len, (*of_scenes, *figures.values()))}) != {len(table["scenes"])}:
+            raise ValueError(f"expected a value for each scene, got {sorted(lengths)} values")
         yield Row(
             run=run,
             method=str(label),
             scenes=tuple(map(str, table["scenes"])),
-            truths=tuple(tuple(map(_number, truth)) for truth in table.get("truths", ())),
+            truths=truths,
             measured={"grid": table.get("grid"), **measured},
             figures=figures,
             failed=sum(map(math.isnan, figures["ssim"])),  # a finite volume always has an SSIM
@@ -162,8 +167,12 @@ def _settings(folder: Path) -> dict[str, Any]:
     settings = yaml_of(path) if path else {}
     if not isinstance(settings, Mapping):
         raise Refused(f"{path}: expected settings by name, got {shown(settings)}")
-    kept = {key: value for key, value in settings.items() if key not in IGNORED_SETTINGS}
-    return {".".join(map(str, keys)): value for keys, value in flatten(kept)}
+    return _by_name({key: v for key, v in settings.items() if key not in IGNORED_SETTINGS})
+
+
+def _by_name(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by their full names; none of an empty mapping."""
+    return {".".join(map(str, keys)): value for keys, value in flatten(settings) if keys}
 
 
 class Interval(NamedTuple):

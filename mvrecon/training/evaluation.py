@@ -212,6 +212,7 @@ def results(
     return {
         "name": settings.name,
         "seed": settings.seed,
+        "scene": settings.test_scene or settings.scene,
         "scenes": names,
         "truths": sizes,
         "grid": {"shape": list(data.grid.shape), "affine": data.grid.affine.tolist()},

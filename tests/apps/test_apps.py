@@ -146,6 +146,7 @@ def test_eval_reproduces_the_table(run, part, tmp_path, capsys):
     assert folder_of_run(folder / "checkpoints") == folder_of_run(folder / part) == folder.resolve()
     again = call(mvrecon.apps.eval, tmp_path / "eval", f"checkpoint={folder / part}")
     assert again["scenes"] == first["scenes"]
+    assert again["scene"] == first["scene"] and first["scene"]["name"] == "ellipsoids"
     for method, row in first["methods"].items():
         for figure in FIGURES:
             # cuDNN may choose other algorithms in another process
@@ -165,6 +166,7 @@ def test_eval_on_another_scene_saves_its_cases(run, tmp_path):
     options = ("scene@test_scene=shepp_logan", "+data.sizes.test=1", "save=true")
     found = call(mvrecon.apps.eval, tmp_path / "eval", f"checkpoint={run[0]}", *options)
     assert len(found["scenes"]) == 1 and found["scenes"] != run[1]["scenes"][:1]
+    assert found["scene"]["name"] == "shepp_logan"
     case = next((tmp_path / "eval" / "cases").iterdir())
     assert {"views.png", "planes.png", "truth.nii.gz", "cross_view_small.nii.gz"} <= {
         p.name for p in case.iterdir()

@@ -15,6 +15,7 @@ import torch
 import mvrecon.apps.reconstruct
 import mvrecon.apps.simulate
 from mvrecon.core.files.atomic import check_room, written_or_kept
+from mvrecon.data.projections.writing import write_projections
 from mvrecon.data.volume_files import read_volume
 from tests.training.runs import call, contents
 
@@ -169,3 +170,17 @@ def test_a_file_is_kept_in_the_first_place_that_takes_it(tmp_path):
     assert kept.read_text() == "whole"
     with pytest.raises(OSError, match="is lost"):
         written_or_kept(tmp_path / "v.mha", write, places[:2])
+
+
+def test_a_disk_that_fills_while_images_are_written_is_named(tmp_path, monkeypatch):
+    """Writing to an open file, as Pillow and NumPy do, raises an error without a name; also tried:
+    mvrecon-simulate rtk=true on a disk of 120 KiB.
+    """
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("mvrecon.data.projections.writing._write", full)
+    with pytest.raises(OSError, match=f"No space left on device: '{tmp_path}/projections'"):
+        write_projections(tmp_path / "projections", torch.ones(1, 2, 2))
+    assert not list(tmp_path.iterdir())

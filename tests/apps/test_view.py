@@ -122,3 +122,14 @@ def test_a_page_of_invalid_content_is_refused(options, message, tmp_path, capsys
     with pytest.raises(SystemExit, match="1"):
         main([str(tmp_path / "v.nii.gz"), *options])
     assert re.fullmatch(f"mvrecon-view: .*{message}.*\n", capsys.readouterr().err)
+
+
+@pytest.mark.parametrize("out", ["head.nii.gz", "rig.json"])
+def test_a_page_never_replaces_an_input(out, marked, monkeypatch, capsys):
+    folder, _ = marked
+    before = {path: path.read_bytes() for path in folder.iterdir()}
+    monkeypatch.chdir(folder)
+    with pytest.raises(SystemExit, match="1"):
+        main(["head.nii.gz", "rig.json", "--out", str(folder / out)])
+    assert "is an input; expected another --out" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.iterdir()} == before

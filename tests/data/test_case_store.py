@@ -177,10 +177,12 @@ def test_cases_of_values_beside_their_header_are_regenerated_when_these_change(t
     assert truth(1000.0) > 1.5 * truth(0.0)
 
 
-@pytest.mark.parametrize("package", [False, True])
-def test_an_edited_scene_of_a_plugin_is_computed_anew(package, tmp_path, monkeypatch):
-    """A module of its own, or another file of its package than the one of the scene."""
-    name = f"edited_{package}"
+@pytest.mark.parametrize(("package", "factory"), [(False, False), (True, False), (False, True)])
+def test_an_edited_scene_of_a_plugin_is_computed_anew(package, factory, tmp_path, monkeypatch):
+    """A module of its own, another file of its package than the one of the scene, or a function
+    that returns a scene of mvrecon.
+    """
+    name = f"edited_{package}_{factory}"
     home = tmp_path / name if package else tmp_path
     home.mkdir(exist_ok=True)
     value = home / "value.py" if package else tmp_path / f"{name}.py"
@@ -192,6 +194,12 @@ def test_an_edited_scene_of_a_plugin_is_computed_anew(package, tmp_path, monkeyp
         "    def sample(self, *case):\n"
         "        return SCENES.build('ellipsoids', value=VALUE).sample(*case)\n"
     )
+    if factory:
+        scene = (
+            "from mvrecon.core.parts import SCENES\n"
+            "def Mine():\n"
+            "    return SCENES.build('ellipsoids', value=VALUE)\n"
+        )
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
 

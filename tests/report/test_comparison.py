@@ -233,6 +233,36 @@ def test_different_patients_of_one_name_are_not_paired(tmp_path):
     assert paired(second, run(tmp_path / "e", more, truths=[1, 2, 3, 4], sirt=(MORE, 1.0))) < 0
 
 
+def test_tables_state_their_test_scenes_themselves(tmp_path):
+    """Evaluations, whose settings do not have the scene of their run, on grids that differ: equal
+    names of two sites are not paired, those of one site are. Also tried: a training beside an
+    evaluation of it, and of another.
+    """
+    runs = {}
+    for name, site, grid in (("a", "A", 1), ("b", "B", 2), ("c", "A", 2)):
+        settings = {"checkpoint": f"runs/{name}", "test_scene": None, "grid": grid}
+        runs[name] = run(tmp_path / name, settings, truths=[1, 2, 3, 4], ours=(MORE, 1.0))
+        (runs[name] / "config.yaml").rename(runs[name] / "eval.yaml")
+        table = json.loads((runs[name] / "results.json").read_text())
+        table["scene"] = {"name": "volumes", "path": site}
+        (runs[name] / "results.json").write_text(json.dumps(table))
+    assert math.isnan(paired(runs["a"], runs["b"])) and paired(runs["a"], runs["c"]) == 0.0
+
+
+@pytest.mark.parametrize("values", ["psnr", "truths", "scenes"])
+@pytest.mark.parametrize("count", [3, 5])
+def test_a_table_with_other_numbers_of_values_than_scenes_is_refused(tmp_path, values, count):
+    """More values would shift the mean without a word."""
+    folder = run(tmp_path / "a", {}, truths=[1, 2, 3, 4], ours=(EASY, 1.0))
+    table = json.loads((folder / "results.json").read_text())
+    holder = {"psnr": table["methods"]["ours"]["psnr"]}.get(values, table)
+    key = "values" if values == "psnr" else values
+    holder[key] = [*holder[key], *holder[key]][:count]
+    (folder / "results.json").write_text(json.dumps(table))
+    with pytest.raises(Refused, match="expected a value for each scene"):
+        read([folder])
+
+
 def test_tables_that_cannot_tell_patients_apart_are_refused(tmp_path, capsys):
     old = run(tmp_path / "a", {}, SITES, ours=(MORE, 1.0))
     for name, settings, scenes, values in (

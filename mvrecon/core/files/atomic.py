@@ -4,7 +4,7 @@ import os
 import shutil
 import socket
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
@@ -38,28 +38,43 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}{PART_ENDING}")
     try:
-        yield part
-        _flush(part, os.O_RDWR)
-        if previous is not None and path.exists():
-            os.replace(path, previous)
-        os.replace(part, path)
-        if os.name == "posix":
-            _flush(path.parent, os.O_RDONLY)
-    except OSError as error:
-        if error.filename is None and error.errno is not None:
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        raise
+        with naming(path):
+            yield part
+            _flush(part, os.O_RDWR)
+            if previous is not None and path.exists():
+                os.replace(path, previous)
+            os.replace(part, path)
+            if os.name == "posix":
+                _flush(path.parent, os.O_RDONLY)
     finally:
         part.unlink(missing_ok=True)
 
 
-def check_writable(path: Path) -> None:
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Context in which an OSError that names no file, as of a full disk, names `path`."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+
+
+def check_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Check that a file can be written at a path, whose folder may not exist yet, without leaving
     anything there.
 
+    Args:
+        path: path of the file.
+        inputs: files that are not to be written to.
+
     Raises:
         OSError: the path is a folder, no permission, no space; the message names the path.
+        ValueError: the path is an input, also through links.
     """
+    if path.resolve() in {one.resolve() for one in inputs}:
+        raise ValueError(f"{path}: is an input; expected another --out")
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file, got a folder")
     nearest = _nearest(path)

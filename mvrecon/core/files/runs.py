@@ -47,6 +47,7 @@ class Results(TypedDict, total=False):
     """A table of results, of a training or an evaluation.
 
     Attributes:
+        scene: settings of the test scenes.
         truths: mean and root mean square of each true volume.
         acquisition: options of the views' detector.
         units: unit of each figure, by name.
@@ -56,6 +57,7 @@ class Results(TypedDict, total=False):
 
     name: str
     seed: int
+    scene: Mapping[str, Any]
     scenes: list[str]
     truths: list[list[float]]
     grid: dict[str, list[Any]]

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import PART_ENDING
+from mvrecon.core.files.atomic import PART_ENDING, naming
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.stack import VIEWS
 
@@ -134,9 +134,10 @@ def _folder_written_whole(folder: Path) -> Iterator[Path]:
     part = folder.with_name(f".{folder.name}.{os.getpid()}{PART_ENDING}")
     part.mkdir(parents=True)
     try:
-        yield part
-        if folder.exists():
-            folder.rmdir()
-        os.replace(part, folder)
+        with naming(folder):
+            yield part
+            if folder.exists():
+                folder.rmdir()
+            os.replace(part, folder)
     finally:
         shutil.rmtree(part, ignore_errors=True)

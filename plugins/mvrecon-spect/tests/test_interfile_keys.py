@@ -1,5 +1,7 @@
 """Every key of Interfile that changes values or places is applied, compared or refused by name."""
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
@@ -578,3 +580,26 @@ def test_numbers_that_are_repeated_are_equal_to_the_last_image(tmp_path: Path):
         (tmp_path / "a.hv").write_text(text.replace("!END", f"{key} := 2001\n!END"))
         with pytest.raises(Refused, match=f"{key}' 2000"):
             read_interfile(tmp_path / "a.hv")
+
+
+@pytest.mark.parametrize("full", ["a.v", "a.hv"])
+def test_a_full_disk_keeps_the_earlier_header_and_its_values(full, tmp_path, monkeypatch):
+    """Values of the new volume with the header of the old one, which has other voxels, would be
+    read without a word; whichever of the two files is the one that does not fit.
+    """
+    old, new = (Grid.centred(4, spacing=s) for s in (1.0, 2.0))
+    write_interfile_volume(tmp_path / "a.hv", torch.ones(old.shape), old)
+    fsync = os.fsync
+
+    def sync(descriptor):
+        if Path(os.readlink(f"/proc/self/fd/{descriptor}")).name.startswith(f".{full}."):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    with pytest.raises(OSError, match="No space left"):
+        write_interfile_volume(tmp_path / "a.hv", torch.full(new.shape, 2.0), new)
+    monkeypatch.undo()
+    values, grid = read_interfile(tmp_path / "a.hv")
+    assert (values == 1).all() and grid.spacing == old.spacing
+    assert {path.name for path in tmp_path.iterdir()} == {"a.hv", "a.v"}

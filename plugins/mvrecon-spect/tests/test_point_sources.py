@@ -63,6 +63,17 @@ def test_the_command_writes_a_response_that_the_projector_reads(tmp_path, capsys
     words = f"{tmp_path}/sources.csv --camera {tmp_path}/rig.json --diameter 2.6 --iterations 0"
     psf.main([*words.split(), "--out", str(out)])
     assert "images are whole" in capsys.readouterr().out
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    (tmp_path / "link.csv").symlink_to(tmp_path / "sources.csv")
+    files.save(rig, tmp_path / "again.cameras.json")
+    again = words.replace("rig.json", "again.cameras.json")
+    for command, place in ((words, "sources.csv"), (words, "link.csv"), (again, "again.csv")):
+        with pytest.raises(SystemExit):
+            psf.main([*command.split(), "--out", str(tmp_path / place)])
+        assert "is an input; expected another --out" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        psf.main([*words.split(), "--out", str(tmp_path / "p0.npy")])
+    assert all(path.read_bytes() == content for path, content in before.items())
     with pytest.warns(UserWarning, match="not converged after 2 iterations"):
         psf.main([*words.split()[:-1], "2", "--out", str(tmp_path / "fitted.csv")])
     assert (

@@ -88,19 +88,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with one_line("mvrecon-psf"):
         table, out = from_home(options.sources), from_home(options.out)
         rig_file = out.with_name(out.stem + RIG_ENDING)
-        for place in (out, rig_file):
-            check_writable(place)
         rows = read_rows(table)
         if not rows or not {*SOURCES[:4]} <= {*rows[0]} <= {*SOURCES}:
             raise Refused(f"{table}: expected a table of {', '.join(SOURCES)}, got another")
+        images = [table.parent / row["views"] for row in rows]
+        for place in (out, rig_file):
+            check_writable(place, [table, from_home(options.camera), *images])
         points = torch.tensor([[float(row[name]) for name in SOURCES[:3]] for row in rows])
         photons = None
         if "photons" in rows[0]:
             photons = torch.tensor([float(row["photons"]) for row in rows])
-        rig = files.from_file(options.camera)
-        stacks = [
-            MeasuredViews(Measured(path=table.parent / r["views"], kind="counts")) for r in rows
-        ]
+        rig = files.from_file(from_home(options.camera))
+        stacks = [MeasuredViews(Measured(path=path, kind="counts")) for path in images]
         for stack in stacks:
             stack.cameras(rig)  # refuses views of another rig
         views = torch.stack([stack.whole().views for stack in stacks])

@@ -8,6 +8,7 @@ vendor's own key.
 
 import difflib
 import math
+import os
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -340,8 +341,8 @@ def numbers_of(header: Header, shape: Sequence[int]) -> Numbers:
 def write_interfile(
     path: str | Path, ending: str, lines: Sequence[str], values: np.ndarray
 ) -> None:
-    """Write a header and its data as little-endian float32; each file is replaced atomically, the
-    header last.
+    """Write a header and its data as little-endian float32; both are whole on the disk
+    before either replaces a file, the header last.
 
     Args:
         path: path of the header.
@@ -366,7 +367,10 @@ def write_interfile(
         *lines,
         "!END OF INTERFILE :=",
     ]
-    with written_whole(data) as part:
-        np.ascontiguousarray(values, "<f4").tofile(part)
-    with written_whole(path) as part:
-        part.write_text("\n".join(head) + "\n", encoding="utf-8")
+    with written_whole(path) as header:
+        with header.open("w", encoding="utf-8") as file:
+            file.write("\n".join(head) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        with written_whole(data) as part:
+            np.ascontiguousarray(values, "<f4").tofile(part)
