@@ -197,8 +197,9 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
     """Raise AssertionError unless the named head satisfies its contract in these frusta.
 
     A module with `keeps_views`; a density of the right shape; finite, with a finite gradient in
-    logits and prior, also for rays that miss and a prior of zero; zero outside the region; and, for a head with
-    `keeps_views = True`, the measured views for any logits and prior, zero on zero rays.
+    logits and prior, also for rays that miss and a prior of zero; zero outside the region; and, for
+    a head with `keeps_views = True`, the measured views for any logits and prior, zero on zero
+    rays.
 
     Args:
         name: name of the head.
