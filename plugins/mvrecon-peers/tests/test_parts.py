@@ -72,7 +72,7 @@ def test_importing_the_parts_imports_no_library():
 def test_methods_refuse_views_that_require_a_gradient(name: str):
     """They compute outside torch; a gradient would be lost."""
     module, method = name.split(".")
-    A = Drr(Grid.centred(4), circular(2, 100.0, 200.0, {"pixels": [4, 4], "pixel_mm": 2.0}))
+    A = Drr(GRID, CONE)
     views = torch.ones(1, 1, *A.range_shape, requires_grad=True)
     with pytest.raises(ValueError, match="Expected tensors without gradient for"):
         getattr(import_module(f"mvrecon_peers.{module}"), method)(A, views)
