@@ -33,9 +33,9 @@ def check_method(name: str, A: Projector, seed: int = 0, **options: Any) -> None
 
     For a network, with random weights, so that zero-initialised layers take part: scaling the views
     scales the volume; gradients of the volume, or of its standard deviation, reach every parameter.
-    A method without parameters explains the views better than an empty volume. Gradients in the
-    views, of methods that have them, are finite, also of empty views and of rows with
-    rounding at their ends.
+    A method without parameters explains the views better than an empty volume. Views that require a
+    gradient are refused with a ValueError or have one, which is finite also for empty views and for
+    rows with rounding at their ends.
 
     Args:
         name: name of the method.
@@ -82,10 +82,11 @@ def _check_input_gradients(
             volume = method(values, A).volume
         except ValueError:  # "Expected tensors without gradient"
             return
+        slope = None
         if volume.requires_grad:
             (slope,) = torch.autograd.grad(volume.square().sum(), values, allow_unused=True)
-            finite = slope is None or bool(slope.isfinite().all())
-            assert finite, "gradients in the views are not finite"
+        assert slope is not None, "views that require a gradient neither have one nor are refused"
+        assert slope.isfinite().all(), "gradients in the views are not finite"
 
 
 def _check_volume(method: nn.Module, views: Float[Tensor, "2 1 m v u"], A: Projector) -> None:
@@ -195,9 +196,10 @@ def check_network(name: str, seed: int = 0, **options: Any) -> None:
 def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None:
     """Raise AssertionError unless the named head satisfies its contract in these frusta.
 
-    A module with `keeps_views`; a density of the right shape; finite, with a finite gradient, also
-    for rays that miss and a prior of zero; zero outside the region; and, for a head with
-    `keeps_views = True`, the measured views for any logits and prior, zero on zero rays.
+    A module with `keeps_views`; a density of the right shape; finite, with a finite gradient in
+    logits and prior, also for rays that miss and a prior of zero; zero outside the region; and, for
+    a head with `keeps_views = True`, the measured views for any logits and prior, zero on zero
+    rays.
 
     Args:
         name: name of the head.
@@ -224,6 +226,7 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
     logits = (3 * torch.randn(2, m, 1, depth, v, u)).requires_grad_()
     prior = torch.rand(logits.shape)
     prior[..., u // 2 :] = 0
+    prior.requires_grad_()
     density = head(logits, prior, views, frusta)
     assert isinstance(density, Tensor), (
         f"a head must return a density as a tensor, got {type(density).__name__}"
@@ -232,8 +235,9 @@ def check_head(name: str, frusta: Frusta, seed: int = 0, **options: Any) -> None
         f"density is {tuple(density.shape)}, logits are {tuple(logits.shape)}"
     )
     assert density.isfinite().all(), "density is not finite"
-    loss = density.square().sum() + 0 * logits.sum()  # some heads ignore logits
-    assert torch.autograd.grad(loss, logits)[0].isfinite().all(), "gradient is not finite"
+    loss = density.square().sum() + 0 * logits.sum() + 0 * prior.sum()  # some heads ignore them
+    gradients = torch.autograd.grad(loss, (logits, prior))
+    assert all(one.isfinite().all() for one in gradients), "gradient is not finite"
     density = density.detach()
     assert not (density * ~frusta.occupied).any(), "density outside the region of interest"
     if keeps_views:

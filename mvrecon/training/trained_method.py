@@ -2,11 +2,11 @@
 
 from typing import TYPE_CHECKING
 
-import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from mvrecon.core.quantities import WeightsFile
+from mvrecon.methods.classical.solver import check_no_gradient
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 
@@ -44,8 +44,8 @@ class TrainedMethod(nn.Module):
 
         return load(self.checkpoint, self.label)
 
-    @torch.no_grad()
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
+        check_no_gradient("trained", views)
         trained = self.loaded()
         trained.module.to(A.device)
         return trained.reconstruct(views, A, str(self.checkpoint), self.fallback)

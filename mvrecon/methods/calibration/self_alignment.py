@@ -30,6 +30,7 @@ from mvrecon.methods.calibration.alignment import (
 )
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
+from mvrecon.methods.classical.solver import check_no_gradient
 from mvrecon.methods.classical.truncation import CUT_EDGE, cut_sides
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
@@ -419,6 +420,7 @@ class Aligned(nn.Module):
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)
+        check_no_gradient("aligned", views)
         # sub-pixel alignment needs float32
         with torch.no_grad(), torch.autocast(views.device.type, enabled=False):
             corrected = self._recalled(views, A) if self.training else self._corrected(views, A)

@@ -108,7 +108,6 @@ class WeightedFit(NamedTuple):
         return squares.flatten(2).sum(dim=2) / (2 * self.level)
 
 
-@torch.no_grad()
 def backprojection(
     A: LinearOperator, views: Float[Tensor, "b c m v u"]
 ) -> Float[Tensor, "b c d h w"]:

@@ -103,13 +103,7 @@ def declares(
                 raise TypeError(f"{name} has no option {option!r}{hint(option, known)}")
             if differentiable:
                 return method(*args, **options)
-            tensors = [value for value in (*args, *options.values()) if isinstance(value, Tensor)]
-            if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-                raise ValueError(
-                    f"Expected tensors without gradient for {name}, which is not differentiable, "
-                    f"got one that requires it; use tikhonov, sirt, fbp or fdk, which are, or "
-                    f"views.detach()"
-                )
+            check_no_gradient(name, *args, *options.values())
             with torch.no_grad():
                 return method(*args, **options)
 
@@ -119,6 +113,20 @@ def declares(
         return checked
 
     return declared
+
+
+def check_no_gradient(name: str, *inputs: object) -> None:
+    """Check that no input of a method that is not differentiable requires a gradient.
+
+    Raises:
+        ValueError: a tensor that requires one, while gradients are recorded.
+    """
+    moving = any(isinstance(one, Tensor) and one.requires_grad for one in inputs)
+    if moving and torch.is_grad_enabled():
+        raise ValueError(
+            f"Expected tensors without gradient for {name}, which is not differentiable, got one "
+            f"that requires it; use tikhonov, sirt, fbp or fdk, which are, or views.detach()"
+        )
 
 
 @dataclass(frozen=True, eq=False)

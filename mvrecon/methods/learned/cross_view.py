@@ -234,7 +234,7 @@ class CrossView(nn.Module):
         """
         if self.log_strength is None:
             return 1.0
-        density = (x.detach().clamp_min(0) + EMPTY_DENSITY)[:, None] * frames.visible
+        density = (x.clamp_min(0) + EMPTY_DENSITY)[:, None] * frames.visible
         relative = weights * frames.visible.sum(dim=0)
         ratio = frames.mean_along_rays(relative, density, like)
         return (1 + (STRENGTH_RATE_FACTOR * self.log_strength).exp() * (ratio - 1)).clamp_min(0)
@@ -360,7 +360,7 @@ class PerViewEstimates(nn.Module):
         """
         frusta, coarse = frames.frusta, coarsened(x, frames.scale)
         prior = frames.to_frames(coarse)
-        missed = frames.integrals(r.detach())
+        missed = frames.integrals(r)
         logits, rest = torch.zeros_like(prior), prior[:, :, :0]
         if self.has_network:
             d = coarsened(RESIDUAL_GAIN * g.direction(r), frames.scale)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.core.numbers import divided
 from mvrecon.methods.learned.view_frames import Frusta
 
 #: Lower bound of the prior relative to its mean along the ray, as no finite logit raises a prior of
@@ -37,8 +38,7 @@ class SoftmaxDepth(nn.Module):
         occupied = frusta.occupied
         prior = prior.clamp_min(0) * occupied
         level = prior.sum(dim=3, keepdim=True) / occupied.sum(dim=-3, keepdim=True).clamp_min(1)
-        relative = prior / level.clamp_min(torch.finfo(prior.dtype).tiny)
-        logits = logits + (relative + MIN_PRIOR).log()
+        logits = logits + (divided(prior, level) + MIN_PRIOR).log()
         # finite, not -inf: a ray without bins in the region must not become NaN
         masked = torch.where(occupied, logits, torch.finfo(logits.dtype).min)
         share = masked.softmax(dim=3) * occupied

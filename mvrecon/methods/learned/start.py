@@ -84,8 +84,8 @@ class ClassicalStart:
     """The initial volume of a network by SIRT with momentum or another method, in the unit of
     (views / mm).
 
-    It is not differentiated. In training another method's volume of a case is computed once, see
-    `CaseCache`.
+    In training another method's volume of a case is computed once, see `CaseCache`, unless views
+    require a gradient.
 
     Args:
         start: iterations of SIRT with momentum, or a classical method: `{name: ..., **options}`.
@@ -100,7 +100,6 @@ class ClassicalStart:
             METHODS.check(start)
         self.start, self._cases = start, CaseCache()
 
-    @torch.no_grad()
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
     ) -> Float[Tensor, "b 1 d h w"]:
@@ -114,7 +113,7 @@ class ClassicalStart:
             parts = [samples] if alike else [[sample] for sample in samples]
             return [torch.cat([self._classical(geometry, views, part) for part in parts])]
 
-        if not training:
+        if not training or views.requires_grad:
             return made(range(len(views)))[0]
         # the functions of now: a notebook's cell may have been run again
         parts = parts_in(self.start, ClassicalPart)
@@ -361,7 +360,6 @@ def reweighted(
     return sirt(geometry.A, views, iterations, weights=weights, momentum=True, start=volume)
 
 
-@torch.no_grad()
 def weighted_for_counts(geometry: Geometry, expected: Float[Tensor, "b 1 m v u"]) -> Geometry:
     """Return the geometry with R the inverse of expected counts, and C the inverse column sums of R
     A, in the unit of the volume by that of the views.

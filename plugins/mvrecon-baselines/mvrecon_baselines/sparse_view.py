@@ -239,10 +239,10 @@ def scaled(
     A: Projector, views: Float[Tensor, "b 1 m v u"], filter: Filter
 ) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b 1 d h w"], Float[Tensor, "b 1 1 1 1"]]:
     """Views and their filtered back-projection, both divided by the scale of the content, and that
-    scale (zero for zero views), through which no gradient flows.
+    scale (zero for zero views).
     """
     volume = filtered(A, views, filter)
-    scale = content_scale(volume.detach())
+    scale = content_scale(volume)
     return views / scale, volume / scale, scale * nonzero(views)
 
 

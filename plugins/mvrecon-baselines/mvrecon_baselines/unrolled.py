@@ -129,7 +129,7 @@ class PrimalDual(nn.Module):
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         y = validated(views, A, next(self.parameters()))
         norm = kept(A, ("norm bound", y.dtype), lambda: norm_bound(A, y.dtype))
-        start = geometry_of(y, A).direction(y).detach()
+        start = geometry_of(y, A).direction(y)
         scale = content_scale(start)
         y = y / (scale * norm)
         f = y.new_zeros(len(y), self.channels, *A.domain_shape)

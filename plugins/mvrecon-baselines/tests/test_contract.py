@@ -17,6 +17,7 @@ from mvrecon.core.parts import NETWORKS
 from mvrecon.methods.learned.baselines import network_by_name
 from mvrecon.methods.method import build_method
 from mvrecon.testing import check_method, check_network
+from mvrecon.testing.measures import gradient_gap
 
 CONF = Path(mvrecon_baselines.conf.__file__).parent
 NET = {"width": 4, "levels": 3}
@@ -47,6 +48,20 @@ def test_slice_methods_keep_the_contract(name, rig, request):
 @pytest.mark.parametrize("name", METHODS)
 def test_methods_keep_the_contract_on_cone_beams(name, cone):
     check_method(name, cone(n_views=8), **METHODS[name])
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_gradients_in_the_views_are_those_of_finite_differences(name, cone):
+    """Also of the start, and of the scale by which views are divided."""
+    A = cone(n_views=8)
+    torch.manual_seed(0)
+    method = build_method({"name": name, **METHODS[name]}).double()
+    with torch.no_grad():
+        for parameter in method.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    views = A(torch.rand(1, 1, *A.grid.shape).double()).requires_grad_()
+    gap = gradient_gap(lambda y: method(y, A).volume, views, directions=1, step=1e-7)
+    assert gap < 1e-5
 
 
 @pytest.mark.parametrize("name", SMALL_NETWORKS)

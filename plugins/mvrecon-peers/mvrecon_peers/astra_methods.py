@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.methods.classical.solver import check_no_gradient
 from mvrecon.operators.operator import Projector, check_views
 from mvrecon_peers.astra import Astra
 
@@ -85,7 +86,8 @@ def _reconstructed(
     options: Mapping[str, Any],
 ) -> Tensor:
     check_views(views, A.cameras)
+    check_no_gradient(f"ASTRA's {algorithm}", views)
     peer = Astra(A.grid, A.cameras, method)
-    cases = [case[0].detach().float() for case in views]
+    cases = [case[0].float() for case in views]
     volumes = [peer.reconstruct(algorithm, case, iterations, options) for case in cases]
     return torch.stack(volumes)[:, None]

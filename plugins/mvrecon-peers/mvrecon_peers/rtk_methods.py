@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.solver import check_no_gradient
 from mvrecon.operators.operator import Projector, check_views
 from mvrecon_peers.rtk import Rtk
 
@@ -160,11 +161,12 @@ def _use_joseph(method: Any) -> None:
 
 def _reconstructed(A: Projector, views: Tensor, name: str, configure: Any) -> Tensor:
     check_views(views, A.cameras)
+    check_no_gradient(f"RTK's {name}", views)
     turn = torch.tensor(TURN, dtype=torch.float64)
     depth, height, width = A.grid.shape
     grid = Grid((height, depth, width), _turned(A.grid, turn))
     rtk = Rtk(grid, A.cameras.moved(turn, torch.zeros(3, dtype=torch.float64)))
-    volumes = [rtk.reconstruct(name, case[0].detach().contiguous(), configure) for case in views]
+    volumes = [rtk.reconstruct(name, case[0].contiguous(), configure) for case in views]
     # from [y, z, x] with y downwards to [z, y, x]
     return torch.stack(volumes).flip(1).transpose(1, 2)[:, None].contiguous()
 

@@ -6,11 +6,13 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid
+from mvrecon.operators.drr import Drr
 
 GRID = Grid.centred(size=(7, 7, 5), spacing=2.0)
 CONE = circular(4, 40.0, 70.0, {"pixels": [5, 7], "pixel_mm": [2.1, 2.3]}, start_degrees=13.0)
@@ -64,3 +66,13 @@ def test_importing_the_parts_imports_no_library():
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=900, check=True
     )
     assert done.stdout == "set()\n"
+
+
+@pytest.mark.parametrize("name", ["astra_methods.astra_sirt", "rtk_methods.rtk_cg"])
+def test_methods_refuse_views_that_require_a_gradient(name: str):
+    """They compute outside torch; a gradient would be lost."""
+    module, method = name.split(".")
+    A = Drr(GRID, CONE)
+    views = torch.ones(1, 1, *A.range_shape, requires_grad=True)
+    with pytest.raises(ValueError, match="Expected tensors without gradient for"):
+        getattr(import_module(f"mvrecon_peers.{module}"), method)(A, views)

@@ -18,6 +18,7 @@ from mvrecon.methods.learned.start import (
 from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Scaled
 from mvrecon.testing import check_method
+from mvrecon.testing.measures import gradient_gap
 from mvrecon.training.losses import ReconstructionLoss
 from tests.methods.learned.rig import SMALL, small, small_projector
 
@@ -45,6 +46,23 @@ def test_weights_equal_those_of_sirt_for_a_uniform_volume(geometry):
     one, other = (g.direction(views - g.A(flat)) for g in (counted, plain))
     # rays that meet next to nothing count as if they expected more
     assert (one - other).norm() < 0.02 * other.norm()
+
+
+def test_weights_of_counts_take_part_in_the_gradient(geometry):
+    """In the volume, the views and the lengths, also of a case that expects nothing."""
+    steps, x = Consistency(COUNTED).double(), volume(geometry, 2).double()
+    views = geometry.A(volume(geometry, 2).double().flip(2)).requires_grad_()
+    x[1] = 0
+    like = Geometry.of(geometry.A, torch.float64)
+
+    def corrected(x, views, lengths):
+        state = {"lengths": lengths}
+        return torch.func.functional_call(steps, state, (like, x, views))[:1]
+
+    lengths = torch.tensor([0.9, 0.8, 0.7]).double().requires_grad_()
+    assert gradient_gap(corrected, x.requires_grad_(), views, lengths) < 1e-7
+    whole = steps(like, x, views).square().sum()
+    assert all(one.isfinite().all() for one in torch.autograd.grad(whole, (x, views)))
 
 
 def test_each_step_lowers_the_weighted_residual_and_keeps_the_truth(geometry):
