@@ -48,9 +48,11 @@ MAX_SHIFTED_UNEXPLAINED, MAX_SHIFTED_RATIO, MIN_SHIFT_DIFFERENCE = 0.03, 0.98, 2
 #: An offset of the detector is reported from so many pixels on, from so many pixels of the coarse
 #: views, and from so many standard errors.
 MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
-#: Ranges of angles that are tried for views at equal steps, in degrees; deviation of a step, and
-#: least change of the range, relative to it.
-ARCS_DEGREES, MAX_STEP_DEVIATION, MIN_ARC_CHANGE = (360.0, 180.0), 0.02, 0.1
+#: Ranges of angles that are tried for views at equal steps, in degrees, the likeliest first, and
+#: how many of them together with another axis; deviation of a step, and least change of the range,
+#: relative to it.
+ARCS_DEGREES, MAX_ARCS_ASIDE = (360, 180, 210, 240, 270, 300, 330), 3
+MAX_STEP_DEVIATION, MIN_ARC_CHANGE = 0.02, 0.05
 #: Size of the grid for views that end inside the object, relative to theirs.
 EXTENDED_GRID_FACTOR = 1.5
 #: What is asked of views that fit better in another orientation than in the stored one.
@@ -98,7 +100,7 @@ def better_rig(seen: "SomeViews") -> str | None:
     least = min((rig.nrmse for rig in rigs), default=0.0)
     if before > MIN_TWO_FAULTS and least > MAX_RESIDUAL_RATIO * stored.nrmse:
         # two changes can help together where neither does alone
-        rigs += [both for rig in turned for both in _shifted(seen, rig, far=True)]
+        rigs += [both for rig in turned[:MAX_ARCS_ASIDE] for both in _shifted(seen, rig, far=True)]
     known = enumerate(rigs)  # their order decides among those that are equally good
     likely = sorted((r.nrmse, n, r) for n, r in known if r.nrmse < stored.nrmse)[:MAX_HYPOTHESES]
     found = [(n, seen.settled(rig), rig) for _, n, rig in likely]
@@ -392,9 +394,9 @@ def _shifted(seen: SomeViews, start: Rig, far: bool) -> list[Rig]:
 
 
 def _turned(seen: SomeViews) -> list[Rig]:
-    """Rigs of views at equal steps over a full or a half circle, or the other way round; none where
-    the cameras are not on a circle, or views end inside the object at a side, of which half a turn
-    is explained by almost any object.
+    """Rigs of views at equal steps over a full circle or a part of it, or the other way round; none
+    where the cameras are not on a circle, or views end inside the object at a side, of which half a
+    turn is explained by almost any object.
     """
     count = len(seen.scan.cameras)
     if seen.cut[1].any():

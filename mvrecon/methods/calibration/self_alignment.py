@@ -31,7 +31,7 @@ from mvrecon.methods.calibration.alignment import (
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
 from mvrecon.methods.classical.solver import check_no_gradient
-from mvrecon.methods.classical.truncation import CUT_EDGE, cut_sides
+from mvrecon.methods.classical.truncation import CUT_EDGE, MAX_AIR, MAX_AIR_SHARE, cut_sides
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.memo import grid_key, kept, place
@@ -142,16 +142,20 @@ def self_aligned(
 
 def share_beside(A: LinearOperator, views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, " b"]:
     """The share of the line integrals in pixels whose rays miss an operator's grid and that exceed
-    what air reads there, their median, by more than `CUT_EDGE` of the greatest one.
+    what air reads there, their median if a flat field may be as far off, by more than `CUT_EDGE` of
+    the mean line integral, weighted by itself, so that neither air, metal nor a hot pixel tells.
     """
-    whole = views.sum(dim=(1, 2, 3, 4))
+    dims = (1, 2, 3, 4)
     missed = A(torch.ones(1, 1, *A.domain_shape, device=A.device))[0, 0] == 0
     beside = views[..., missed]
     if not beside.shape[-1]:
-        return torch.zeros_like(whole)
+        return views.new_zeros(len(views))
+    level = divided(views.square().sum(dims, True), views.sum(dims, True))
     air = beside.median(dim=-1).values[..., None, None, None]
-    above = (blurred(views, BESIDE_BLUR_PX, missed) - air) > CUT_EDGE * views.amax((2, 3, 4), True)
-    return divided(((views - air) * (above & missed)).sum(dim=(1, 2, 3, 4)), whole)
+    air = air * (air < (MAX_AIR_SHARE * level).clamp_max(MAX_AIR))
+    shown = views - air
+    above = blurred(shown, BESIDE_BLUR_PX, missed) > CUT_EDGE * level
+    return divided((shown * (above & missed)).sum(dims), shown.sum(dims))
 
 
 def _best(A: Projector, measured: Float[Tensor, "b 1 m v u"], by: Alignment) -> CorrectedViews:

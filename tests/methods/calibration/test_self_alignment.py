@@ -16,6 +16,7 @@ from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.calibration.self_alignment import (
     Aligned,
     self_aligned,
+    share_beside,
     standing_still,
 )
 from mvrecon.methods.classical.sirt import sirt
@@ -322,6 +323,38 @@ def test_a_grid_that_does_not_hold_the_object_is_said_where_its_views_are_not_al
         by = self_aligned(A, views).alignment
     said = [line for line in caught if "extends beyond the grid" in str(line.message)]
     assert by.shift_px.any() == held and len(said) == (not held)
+
+
+@pytest.mark.parametrize("fault", ["none", "flat", "hot pixel", "metal"])
+@pytest.mark.parametrize(
+    ("radius", "size"), [(80.0, 30.0), (80.0, 58.0), (34.0, 40.0), (24.0, 60.0)]
+)
+def test_the_share_of_an_object_outside_the_grid(radius, size, fault):
+    """Of balls in closed form, also where a panel inside the object sees no air; the share is that
+    of the rays that miss the box. Also tried: long cylinders, slabs, balls off the axis, noise of
+    100 photons.
+    """
+    rig = circular(8, 300.0, 450.0, {"pixels": [60, 60], "pixel_mm": 2.0})
+    grid = Grid.centred(60, spacing=size / 60)
+    start, end = (x.double() for x in rig.rays())
+    way = end - start
+
+    def through(radius):
+        a, b = way.square().sum(dim=-1), (way * start).sum(dim=-1)
+        c = start.square().sum(dim=-1) - radius**2
+        return 2 * ((b**2 - a * c).clamp_min(0) / a).sqrt()
+
+    views = 0.01 * through(radius)
+    sides = torch.stack([(side * size / 2 - start) / way for side in (-1, 1)])
+    missed = sides.amin(dim=0).amax(dim=-1) >= sides.amax(dim=0).amin(dim=-1)
+    views = views + (2.0 * through(2.0) if fault == "metal" else 0.0)
+    share = (views * missed).sum() / views.sum()
+    if fault == "hot pixel":
+        views[3, 10, 10] = 20.0
+    flat = 0.03 if fault == "flat" else 0.0
+    A = PROJECTORS.build("drr", grid=grid, cameras=rig)
+    found = share_beside(A, (views + flat)[None, None].float())
+    assert found.item() == pytest.approx(share.item(), abs=0.03)
 
 
 @pytest.mark.parametrize("fault", ["far", "counts", "narrow"])
