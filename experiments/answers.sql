@@ -98,6 +98,8 @@ union all select printf('adjoint is %.1f times as fast as ASTRA''s', astra) from
 union all select printf('to %.0e of the largest value, `siddon` to %.0e', max(largest) filter (where method != 'siddon'), max(largest) filter (where method = 'siddon')) from differences
 union all select printf('to %.1f and %.1f %%', (select 100 * [difference from NumPy] from [experiments/25_measured/synchrotron.csv]),
   (select 100 * [difference from NumPy] from [experiments/25_measured/neutron.csv] where correction = 'found'))
+union all select printf('%.1f dB behind `cross_view` from robust SIRT', max(psnr) filter (where method like 'cross_view%') - max(psnr) filter (where method = 'dual_domain, narrow'))
+  from (select method, avg(psnr) as psnr from [experiments/26_published/tuning.csv] where steps = 200 group by method, rate)
 union all select printf('by %.0f to %.0f in the log-likelihood', min(lead), max(lead)) from ahead
 union all select printf('`robust_sirt`, %.1f dB ahead of SIRT', lead) from robust
 union all select printf('%.1f dB ahead of `world_unet` if both start from SIRT', lead) from networks where method = 'cross_view'
