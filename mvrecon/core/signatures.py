@@ -111,7 +111,9 @@ def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Op
     if is_typeddict(owner):
         types = get_type_hints(owner, include_extras=True)
         return {k: Option(t, ..., texts.get(k, "")) for k, t in types.items()}, False
-    call: Any = owner.__init__ if inspect.isclass(owner) else owner
+    call: Any = owner
+    if inspect.isclass(owner):  # named tuples, for example, have no constructor but __new__
+        call = owner.__new__ if owner.__init__ is object.__init__ else owner.__init__
     texts |= _texts(call.__doc__)
     types = _hints(call)
     own = fields(owner) if is_dataclass(owner) else ()
