@@ -1,6 +1,6 @@
 """The cross-view model: per-view estimates from a depth network in each camera's frustum, compared
 by re-projection into the other cameras' frames, fused by a weighting network; rays count by their
-camera's weights along them and by a 2-D U-Net on their view.
+camera's weights along them and by a 2-D U-Net on their view, which also corrects the view.
 
 `docs/model.md` lists the steps of `CrossView.forward`.
 """
@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from mvrecon.core.numbers import divided
 from mvrecon.core.parts import HEADS, WEIGHTINGS, HeadPart, WeightingPart
 from mvrecon.core.quantities import NonNegativeInt
 from mvrecon.core.registry import check_choice
@@ -41,7 +42,8 @@ from mvrecon.methods.method import Reconstruction
 from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import SUPPORT_KINDS, ViewNoise
 
-#: Gain of residuals, which are small relative to the views, at a network's input.
+#: Gain of residuals, which are small relative to the views, at a network's input; its inverse is
+#: that of changes of views at a network's output.
 RESIDUAL_GAIN = 8.0
 #: Density of an empty voxel in the mean along a ray, relative to the content's scale.
 EMPTY_DENSITY = 0.01
@@ -66,8 +68,8 @@ class CrossView(nn.Module):
         depth_widths: the same for the depth network in the frusta; none for no depth network, thus
             neither a confidence nor features, with depths that are not learned.
         weight_widths: the same for the weighting network, if it has an option `widths`.
-        ray_widths: the same for the 2-D U-Net that weights single rays, see `RayUNet`; none: rays
-            count by their camera's weights alone.
+        ray_widths: the same for the 2-D U-Net that weights and corrects single rays, see `RayUNet`;
+            none: rays count by their camera's weights alone.
         features: channels passed from the depth network to the volume network.
         scale: halvings of the grid at which per-view estimates are computed.
         depths: bins along each ray.
@@ -136,7 +138,6 @@ class CrossView(nn.Module):
         if fusion == "weighted":
             inputs = len(CHANNELS) if depth_widths else len(CHANNELS) - 1  # the confidence
             self.weight_net = weighting_network(weighting, inputs, weight_widths, precision)
-        self.ray_net = RayUNet(ray_widths, precision) if weigh_rays and ray_widths else None
         self.scale = scale
         self.entry = nn.Conv3d(2 + self.estimates.features, widths[scale], 1, bias=False)
         nn.init.zeros_(self.entry.weight)  # before training: SIRT
@@ -145,6 +146,9 @@ class CrossView(nn.Module):
         unequal = weigh_rays and fusion == "weighted"
         self.log_strength = nn.Parameter(torch.zeros(())) if unequal else None
         self.consistency = Consistency(consistency)
+        self.ray_net = None
+        if weigh_rays and ray_widths:
+            self.ray_net = RayUNet(ray_widths, not self.consistency.poisson, precision)
         self.reweight = (0 if self.consistency.poisson else 12) if reweight is None else reweight
         if self.reweight < 0 or (self.reweight and self.consistency.poisson):
             raise ValueError(
@@ -173,20 +177,22 @@ class CrossView(nn.Module):
         logits = self.weight_logits(compared, coarse, confidence, frames.visible)
         fused, weights = fuse(torch.cat([change, features], 2), logits, frames.visible)
         ray_weights = self.ray_weights(frames, coarse, weights, y)
+        corrected = y
         if self.ray_net is not None:
-            ray_weights = ray_weights * self.ray_net(g, y, r)
+            factors, corrected = self.ray_net(g, y, r)
+            ray_weights = ray_weights * factors
 
         x = start
         if self.reweight:
-            x = reweighted(g, start, y, ray_weights, self.reweight)
-            r = y - A(x)
+            x = reweighted(g, start, corrected, ray_weights, self.reweight)
+        r = corrected - (A(x) if self.reweight else projected)
         d = g.direction(r, ray_weights)
         _, spread = pooled(change, frames.visible)
         update = fused[:, :1] - (coarsened(x, self.scale) - coarse)
         fused = [RESIDUAL_GAIN * update, RESIDUAL_GAIN * deviation(spread)[:, 0], fused[:, 1:]]
         learned = self.learned_change(g, x, d, torch.cat(fused, 1))
         entry = x + g.within(learned + self.step * d)
-        x = self.consistency(g, entry, y, ray_weights).clamp_min(0)
+        x = self.consistency(g, entry, corrected, ray_weights).clamp_min(0)
         return Reconstruction(
             x * scale,
             per_view=(coarse[:, None] + change) * scale[:, None],
@@ -403,31 +409,37 @@ class PerViewEstimates(nn.Module):
 
 class RayUNet(PlainUNet):
     """A 2-D U-Net on each view, at the detector's resolution and with the same parameters for all
-    cameras: the weight of each ray relative to the others of its view, 2 sigmoid(logit).
+    cameras: the weight of each ray relative to the others of its view, 2 sigmoid(logit), and the
+    change of its value, which may remove what a weight cannot, as smooth scatter in a whole view.
 
     The mean logit of the rays that meet the region is subtracted for each view, so that a factor
     says nothing about its camera, whose weights are those of `CrossView.ray_weights`. All factors
-    are one before training.
+    are one and all changes zero before training.
 
     Args:
         widths: channels of each scale, the finest first.
+        corrects: whether values are changed, or else are as measured, as counts that are to be
+            conserved.
         precision: precision of the convolutions.
     """
 
-    def __init__(self, widths: Sequence[int], precision: Precision = "auto"):
-        super().__init__(2, 2, 1, widths, zero=1, precision=precision)
-        self.last.bias = None  # no effect: the mean is subtracted
+    def __init__(self, widths: Sequence[int], corrects: bool, precision: Precision = "auto"):
+        outputs = 1 + corrects
+        super().__init__(2, 2, outputs, widths, zero=outputs, precision=precision)
+        self.last.bias = None  # the logits' mean is subtracted, and air reads zero
 
     def forward(
         self, g: Geometry, y: Float[Tensor, "b 1 m v u"], r: Float[Tensor, "b 1 m v u"]
-    ) -> Float[Tensor, "b 1 m v u"]:
-        """Return the factors of views and residual views."""
+    ) -> tuple[Float[Tensor, "b 1 m v u"], Float[Tensor, "b 1 m v u"]]:
+        """Return the factors and the corrected views of views and residual views."""
         seen = torch.cat([g.row * y, RESIDUAL_GAIN * g.row * r], dim=1).transpose(1, 2)
-        logits = super().forward(seen.flatten(0, 1)).unflatten(0, seen.shape[:2]).transpose(1, 2)
+        answer = super().forward(seen.flatten(0, 1)).unflatten(0, seen.shape[:2]).transpose(1, 2)
+        logits, change = answer.tensor_split([1], dim=1)  # no change of counts
         reached = (g.row > 0).expand_as(logits)
         sums = (logits * reached).sum(dim=(3, 4), keepdim=True)
         mean = sums / reached.sum(dim=(3, 4), keepdim=True).clamp_min(1)
-        return 2 * (RAY_LOGIT_RATE_FACTOR * (logits - mean)).sigmoid()
+        factors = 2 * (RAY_LOGIT_RATE_FACTOR * (logits - mean)).sigmoid()
+        return factors, y + divided(change / RESIDUAL_GAIN, g.row).sum(dim=1, keepdim=True)
 
 
 class OneEach(nn.Module):
