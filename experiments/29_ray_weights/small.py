@@ -111,16 +111,11 @@ def main() -> None:
     torch.set_num_threads(1)
     faults, A = None if given.clean else FAULTS, mv.Drr(GRID, RIG)
     train_file, test_file = (given.data / f"openkbp_{name}.h5" for name in ("train", "val"))
-    left_out = HELD_OUT if given.validate else ()
+    left_out, tested = (HELD_OUT, train_file) if given.validate else (range(0), test_file)
     indices = (i for i in count() if i % PATIENTS not in left_out)
-    views, volumes, _ = cases(
-        train_file, islice(indices, min(BATCH * given.steps, 4000)), 0, True, faults
-    )
-    tests = (
-        cases(train_file, HELD_OUT, 1, False, faults)
-        if given.validate
-        else cases(test_file, range(33), 1, False, faults)
-    )
+    indices = islice(indices, min(BATCH * given.steps, 4000))
+    views, volumes, _ = cases(train_file, indices, 0, True, faults)
+    tests = cases(tested, left_out or range(33), 1, False, faults)
     arms = OmegaConf.to_container(OmegaConf.load(given.arms))
     with given.out.open("a+", newline="") as file:
         file.seek(0)

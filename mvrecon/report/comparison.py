@@ -99,8 +99,8 @@ def read(places: Iterable[str | Path]) -> list[Row]:
 
 def rows_of(table: Results, run: str, folder: Path) -> Iterator[Row]:
     """The methods of a result table, under a run's name."""
-    told = {"test_scene": table["scene"]} if "scene" in table else {}
-    settings = {**_settings(folder), **_by_name(told)}
+    stated = {"test_scene": table["scene"]} if "scene" in table else {}
+    settings = {**_settings(folder), **_by_name(stated)}
     measured = {k: v for k, v in settings.items() if k.split(".")[0] in SCENE_SETTINGS}
     truths = tuple((_number(mean), _number(rms)) for mean, rms in table.get("truths", ()))
     of_scenes = [table["scenes"], truths or table["scenes"]]

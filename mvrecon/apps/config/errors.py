@@ -34,7 +34,7 @@ PROGRAM_FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 #: What OmegaConf adds to its messages for programmers.
 OMEGACONF_DETAILS = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
-#: A number in a sentence; digits in names, such as those of files, tell what it is about.
+#: A number in a sentence; digits within a name, such as that of a file, distinguish warnings.
 NUMBER = re.compile(r"[^\w\s/\\]*\d[\d.,:e+x-]*[^\w\s/\\]*")
 
 #: What installs choices: beginnings of their names, and the argument of pip install.

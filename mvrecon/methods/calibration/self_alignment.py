@@ -142,8 +142,9 @@ def self_aligned(
 
 def share_beside(A: LinearOperator, views: Float[Tensor, "b 1 m v u"]) -> Float[Tensor, " b"]:
     """The share of the line integrals in pixels whose rays miss an operator's grid and that exceed
-    what air reads there, their median if a flat field may be as far off, by more than `CUT_EDGE` of
-    the mean line integral, weighted by itself, so that neither air, metal nor a hot pixel tells.
+    the reading of air by more than `CUT_EDGE` of the mean line integral, which is weighted by
+    itself, so that neither air, metal nor a hot pixel determines the threshold. The reading of air
+    is the median of these pixels if a flat field may be as far off, else zero.
     """
     dims = (1, 2, 3, 4)
     missed = A(torch.ones(1, 1, *A.domain_shape, device=A.device))[0, 0] == 0

@@ -132,8 +132,8 @@ def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:
 
 
 def _air_along(ends: Float[Tensor, "g k n i"]) -> Float[Tensor, "g k n i"]:
-    """What air reads along rows: the straight line below the means of all blocks that is highest in
-    the middle, as a flat field may be off by another part at one side of the panel.
+    """The reading of air along rows: of the straight lines below the means of all blocks, the one
+    that is highest in the middle. The error of a flat field may differ between the panel's sides.
     """
     place = torch.arange(ends.shape[-1]).to(ends) - (ends.shape[-1] - 1) / 2
     rise = ends[..., :, None] - ends[..., None, :]
@@ -182,7 +182,7 @@ def _behind(
     views = views / scale
     value, slope, curvature = _parabola(views[..., -fitted:].square(), columns)
     edge = views[..., -max(1, round(EDGE * columns)) :].mean(dim=-1, keepdim=True)
-    # rounding's square: quotients by less have gradients beyond the numbers
+    # the gradients of quotients by smaller values overflow
     value = torch.maximum(value, edge.square() / 4).clamp_min(known.eps**2)
     slope = (slope / value).clamp_max(MAX_GROWTH)
     bend = torch.maximum(-curvature / value, 1 + slope).clamp_min(0)  # zero at a row's length

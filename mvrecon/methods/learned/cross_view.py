@@ -409,8 +409,9 @@ class PerViewEstimates(nn.Module):
 
 class RayUNet(PlainUNet):
     """A 2-D U-Net on each view, at the detector's resolution and with the same parameters for all
-    cameras: the weight of each ray relative to the others of its view, 2 sigmoid(logit), and the
-    change of its value, which may remove what a weight cannot, as smooth scatter in a whole view.
+    cameras: the weight of each ray relative to the others of its view, 2 sigmoid(logit), and a
+    change of its value. The change can remove an additive error of a whole view, such as smooth
+    scatter; a weight can only discard the view.
 
     The mean logit of the rays that meet the region is subtracted for each view, so that a factor
     says nothing about its camera, whose weights are those of `CrossView.ray_weights`. All factors
@@ -418,8 +419,7 @@ class RayUNet(PlainUNet):
 
     Args:
         widths: channels of each scale, the finest first.
-        corrects: whether values are changed, or else are as measured, as counts that are to be
-            conserved.
+        corrects: whether values are changed; not for counts, which are to be conserved.
         precision: precision of the convolutions.
     """
 
