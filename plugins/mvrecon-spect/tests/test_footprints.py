@@ -264,6 +264,23 @@ def test_kernels_equal_the_reference_and_have_its_adjoint(options, mu, dtype, to
     assert products[0] == pytest.approx(products[1], rel=tolerance)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_rounding_does_not_decide_whether_a_voxel_is_seen(dtype, backend):
+    """Of voxels that touch the pinhole's plane; they are not."""
+    side = 7.1
+    grid = Grid.centred(6, spacing=side, centre=(180 - 3 * side, 0, 0))
+    x = torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(0)).to(dtype)
+    views = [
+        Spect(grid, pinhole(24, 200.0, way=180 + moved), blur=True, backend=backend)(x)
+        for moved in (-1e-9, -3e-14, 0.0, 3e-14, 1e-9)
+    ]
+    inner = grid.cropped(Box((0, 0, 0), (6, 6, 5)))  # without the voxels that touch
+    views.append(Spect(inner, pinhole(24, 200.0), blur=True, backend=backend)(x[..., :5]))
+    for view in views[1:]:
+        torch.testing.assert_close(view, views[0], rtol=1e-4, atol=0)
+
+
 def test_single_entries_of_forward_and_adjoint_are_the_same_numbers():
     grid, rig, x = small()
     A = Spect(grid, rig, 4.0, mu=0.01, **BLUR)

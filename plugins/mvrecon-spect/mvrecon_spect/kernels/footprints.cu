@@ -6,6 +6,7 @@ enum { OF_W = 8, LENGTH = 12, AREA = 13, SECANT = 14, LEAST_COSINE = 20, FOOT = 
 enum { BLUR = 41, RADIAL = 47, SHIFT = 53, EFFICIENCY = 55, RECORD = 58 };
 enum { TILE = 4 };  // pixels of a thread of `project_footprints`, along u and v
 #define MIDDLE (0.5 * (TILE - 1))
+#define BEFORE_PLANE 0.50001  // least distance of a voxel's centre from the pinhole's plane, in depths of the voxel
 
 // Arguments of a kernel, as in `cuda.py`.
 struct Pinholes {
@@ -78,7 +79,7 @@ template <class R> struct Footprint {
     const R* r = (const R*)f.typed + (long long)pinhole * RECORD;
     double q[3];
     UNROLL for (int i = 0; i < 3; i++) q[i] = map[4 * i] * index[0] + map[4 * i + 1] * index[1] + map[4 * i + 2] * index[2] + map[4 * i + 3];
-    if (!(-q[2] > (fabs(map[OF_W]) + fabs(map[OF_W + 1]) + fabs(map[OF_W + 2])) / 2)) return;
+    if (!(-q[2] > BEFORE_PLANE * (fabs(map[OF_W]) + fabs(map[OF_W + 1]) + fabs(map[OF_W + 2])))) return;
     double over_w = 1 / q[2];
     R image[2] = {(R)(q[0] * over_w), (R)(q[1] * over_w)}, per = (R)over_w, m = -per, u = image[0], v = image[1];
     const R* c = r + SECANT;

@@ -17,7 +17,7 @@ from mvrecon_spect.kernels.profile import (
     VARIANCE,
     VARIANCE_STEP,
 )
-from mvrecon_spect.kernels.reference import AREA, LEAST_COSINE, LENGTH
+from mvrecon_spect.kernels.reference import AREA, BEFORE_PLANE, LEAST_COSINE, LENGTH
 from mvrecon_spect.kernels.rows import add_rows, sum_rows
 
 #: Voxels in a block; values added to a row of a view at a time, and of narrow footprints.
@@ -137,7 +137,7 @@ def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
         cu, cv: coefficients of the cumulative distributions.
     """
     real = s.dtype.type
-    one, half = real(1), real(0.5)
+    one = real(1)
     q1 = real(record[U] * i + record[U + 1] * j + record[U + 2] * k + record[U + 3])
     q2 = real(record[V] * i + record[V + 1] * j + record[V + 2] * k + record[V + 3])
     q3 = real(record[W] * i + record[W + 1] * j + record[W + 2] * k + record[W + 3])
@@ -147,7 +147,7 @@ def _block(record, r, pieces, i, j, k, count, detector, s, n, cu, cv):
     c0, c1, c2, c3, c4, c5 = (
         r[SECANT], r[SECANT + 1], r[SECANT + 2], r[SECANT + 3], r[SECANT + 4], r[SECANT + 5]
     )  # fmt: skip
-    near = half * (abs(d0) + abs(d1) + abs(d2))
+    near = real(BEFORE_PLANE) * (abs(d0) + abs(d1) + abs(d2))
     footu, footv, tanu, tanv = r[FOOT], r[FOOT + 1], r[TANGENT], r[TANGENT + 1]
     pu, pv, second, fourth = r[PER_MM], r[PER_MM + 1], r[HOLE], r[HOLE + 1]
     pu2, pv2, twelfth, share4 = pu * pu, pv * pv, real(1 / 12), real(1 / 120)

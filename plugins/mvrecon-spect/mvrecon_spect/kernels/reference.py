@@ -39,6 +39,9 @@ DETECTOR, RADIAL = slice(41, 47), slice(47, 53)
 #: Shift in mm per tangent, by 1, t; efficiency by 1, t, t^2.
 SHIFT, EFFICIENCY = slice(53, 55), slice(55, 58)
 COLUMNS = 58
+#: Least distance of a voxel's centre from the pinhole's plane, in depths of the voxel; more than a
+#: half, so that rounding does not decide whether a voxel that touches the plane is seen.
+BEFORE_PLANE = 0.50001
 #: Most voxels at a time.
 AT_ONCE = 2**16
 
@@ -112,8 +115,8 @@ def footprints(record: Float[Tensor, " c"], index: Float[Tensor, "p 4"]) -> Voxe
     """The footprints of voxels at the indices (i, j, k, 1)."""
     to_u, to_v, to_w = record[OF_U], record[OF_V], record[OF_W]
     w = index @ to_w
-    # a voxel that the pinhole's plane cuts, or behind it, is not seen
-    seen = -w > to_w[:3].abs().sum() / 2
+    # a voxel that the pinhole's plane cuts or touches, or behind it, is not seen
+    seen = -w > BEFORE_PLANE * to_w[:3].abs().sum()
     w = torch.where(seen, w, -1.0)
     centre = torch.stack([index @ to_u, index @ to_v]) / w
     tangents = (centre - record[FOOT, None]) * record[TANGENT, None]

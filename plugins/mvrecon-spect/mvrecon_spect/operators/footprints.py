@@ -8,8 +8,8 @@ pixel; see `mvrecon_spect.kernels.reference`.
 
 Limits: the image of a round hole is a product of profiles along u and v, of the right variance and
 kurtosis, not a disc, which shows if it is several pixels wider than the object's detail.
-Perspective within a voxel is not modelled, and voxels that a pinhole's plane cuts contribute
-nothing.
+Perspective within a voxel is not modelled, and voxels that a pinhole's plane cuts or touches
+contribute nothing.
 """
 
 import math
