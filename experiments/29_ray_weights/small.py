@@ -28,10 +28,17 @@ BATCH, RANGE = 4, 0.04
 PATIENTS, HELD_OUT = 170, range(150, 170)
 GRID = mv.Grid.centred(size=(16, 16, 16), spacing=(32.0, 20.0, 24.0))
 DETECTOR = {"pixels": [24, 24], "pixel_mm": [36.0, 40.0]}
-RIG = CAMERAS.build(
-    "circular", n_views=8, arc_degrees=180.0, sid=1000.0, sdd=1500.0, detector=DETECTOR
+HEADER = (
+    *("method", "seed", "steps", "rate", "patients", "arc"),
+    *("case", "psnr", "psnr_inside", "seconds"),
 )
-HEADER = ("method", "seed", "steps", "rate", "case", "psnr", "psnr_inside", "seconds")
+
+
+def rig(arc_degrees: float = 180.0) -> mv.Cameras:
+    """Eight cone-beam cameras."""
+    return CAMERAS.build(
+        "circular", n_views=8, arc_degrees=arc_degrees, sid=1000.0, sdd=1500.0, detector=DETECTOR
+    )
 
 
 def cases(
@@ -41,7 +48,7 @@ def cases(
     scene = SCENES.build("hdf5", path=str(path), orientation="LPI", fine=2, rays=2, vary=vary)
     acquisition = Acquisition.of({"photons": float("inf"), "disturbed": faults})
     acquired = Acquired(scene, {"name": "drr"}, acquisition)
-    samples = [acquired.sample(i, seed, GRID, RIG) for i in indices]
+    samples = [acquired.sample(i, seed, GRID, rig()) for i in indices]
     parts = ([getattr(one, name) for one in samples] for name in ("views", "volume", "inside"))
     return tuple(map(torch.stack, parts))
 
@@ -98,6 +105,17 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--steps", type=int, default=800, help="steps of a training (800)")
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each method (1)")
     parser.add_argument("--rates", type=float, nargs="*", default=[2e-3], help="learning rates")
+    parser.add_argument(
+        "--patients",
+        type=int,
+        help="train on so many patients, as they are (all, varied at random)",
+    )
+    parser.add_argument(
+        "--arc",
+        type=float,
+        default=180.0,
+        help="arc in degrees of the cameras that methods are told; views have 180 (180)",
+    )
     parser.add_argument("--clean", action="store_true", help="views without faults")
     parser.add_argument(
         "--validate", action="store_true", help="test on 20 patients that training leaves out"
@@ -109,17 +127,17 @@ def main() -> None:
     """Train, test, add to the file."""
     given = arguments()
     torch.set_num_threads(1)
-    faults, A = None if given.clean else FAULTS, mv.Drr(GRID, RIG)
+    faults, A = None if given.clean else FAULTS, mv.Drr(GRID, rig(given.arc))
     train_file, test_file = (given.data / f"openkbp_{name}.h5" for name in ("train", "val"))
     left_out, tested = (HELD_OUT, train_file) if given.validate else (range(0), test_file)
     indices = (i for i in count() if i % PATIENTS not in left_out)
-    indices = islice(indices, min(BATCH * given.steps, 4000))
-    views, volumes, _ = cases(train_file, indices, 0, True, faults)
+    indices = islice(indices, given.patients or min(BATCH * given.steps, 4000))
+    views, volumes, _ = cases(train_file, indices, 0, given.patients is None, faults)
     tests = cases(tested, left_out or range(33), 1, False, faults)
     arms = OmegaConf.to_container(OmegaConf.load(given.arms))
     with given.out.open("a+", newline="") as file:
         file.seek(0)
-        known = {tuple(row[:4]) for row in csv.reader(file)}
+        known = {tuple(row[:6]) for row in csv.reader(file)}
         writer = csv.writer(file, lineterminator="\n")
         if not known:
             writer.writerow(HEADER)
@@ -128,6 +146,7 @@ def main() -> None:
             method, begun = build_method(arms[arm]), time.process_time()
             trained = any(True for _ in method.parameters())
             row = (arm, seed, given.steps if trained else 0, rate if trained else 0)
+            row += (given.patients or "", given.arc)
             if tuple(map(str, row)) in known or (seed and not trained):
                 continue
             if trained:
