@@ -305,7 +305,7 @@ def _distributed(
         apart: how far the panels of the views are apart, from 0 to 1: equal ones keep their cells.
     """
     own = cells * (edge > 0)
-    if apart == 0:
+    if apart < 1e-9:
         return own
     edge, level = ((x / (PANEL_TAPER * edge.max())).clamp_max(1) for x in (edge, level))
     edge, level = (x.square() * (3 - 2 * x) for x in (edge, level))
