@@ -300,7 +300,7 @@ def _joined(scan: Scan, grid: Grid) -> int:
     """Pixels joined into one each way: the most that a voxel's image holds and the detector has a
     multiple of.
     """
-    fitting = max(grid.spacing) / resolution(scan.cameras, grid.centre)
+    fitting = max(grid.spacing) / resolution(scan.cameras, grid.centre) + 1e-6
     rows, columns = scan.cameras.shape
     shared = math.gcd(rows, columns)
     return max(n for n in range(1, shared + 1) if shared % n == 0 and (n == 1 or n <= fitting))

@@ -294,7 +294,7 @@ def coarse_grid(scan: Scan) -> Grid:
 
 def _region(scan: Scan, grid: Grid) -> Region:
     """Pixels of the size of a voxel's image."""
-    size = max(1, int(max(grid.spacing) / resolution(scan.cameras, grid.centre)))
+    size = max(1, int(max(grid.spacing) / resolution(scan.cameras, grid.centre) + 1e-6))
     rows, columns = scan.cameras.shape
     joined = (min(size, rows), min(size, columns))
     kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])

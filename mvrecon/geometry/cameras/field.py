@@ -160,6 +160,7 @@ def extended_to_field(cameras: Cameras, grid: Grid) -> Grid:
         return grid
     low, high = grid.to_index(field.corners()).aminmax(dim=0)
     slack = max(field.spacing) / 2 / low.new_tensor(grid.spacing)
+    slack = slack + 1e-6  # above rounding
     before = (-0.5 - slack - low).ceil().clamp_min(0)
     after = (high - low.new_tensor(grid.size) + 0.5 - slack).ceil().clamp_min(0)
     affine = grid.affine.clone()

@@ -231,18 +231,18 @@ class _Branches:
     ) -> "_Branches":
         """From sorted angles in radians, and each view's distance from the edges of its panel."""
         taper = max(MIN_TAPER, 0 if parallel else 4 * field)
-        count = max(MIN_ANGLES, ANGLES_PER_VIEW * len(angles))
-        step = FULL_TURN / count
-        places = (torch.arange(count, dtype=torch.float64) + 0.5) * step
         gaps = _gaps(angles)
         usual = _usual(gaps)
+        count = _raster(len(angles), usual)
+        step = FULL_TURN / count
+        places = (torch.arange(count, dtype=torch.float64) + 0.5) * step
         most = min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
         named = min(most, min(usual, _even(gaps)) + NAMED_GAP)
         measured, near = (
             _covered(angles, places, edge > 0, gap, min(usual, gap)) for gap in (most, named)
         )
         edge = edge.clamp_min(0)
-        index = (angles / step).long().clamp_max(count - 1).expand_as(edge)
+        index = (angles / step + 1e-6).long().clamp_max(count - 1).expand_as(edge)
         # a morphological closing in the angle: views that measure a line less deeply than those
         # around them, or not at all, make no gap
         level = edge.new_zeros(len(q), count).scatter_reduce(1, index, edge, "amax")
@@ -258,7 +258,7 @@ class _Branches:
         lines = torch.stack([level, beside, measured.double(), near.double()])
         other, there, *conjugates = _conjugate(lines, q, parallel)
         # where the other branch does not measure a line, this one does not end at a gap
-        firmness = torch.where(outside.amax(dim=1) > 2 * reach, 8.0, 2.0)[:, None]
+        firmness = torch.where(outside.amax(dim=1) > 2 * reach + 1e-9, 8.0, 2.0)[:, None]
         firm = (firmness * other / (other + without_gaps).clamp_min(1e-300)).clamp_max(1)
         strength = torch.lerp(without_gaps * beside, inside, firm)
         conjugate = _conjugate(strength, q, parallel)
@@ -278,7 +278,11 @@ class _Branches:
         upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
         upto = upto + turn * whole[:, -1:]
         cells = upto.diff(dim=1, prepend=upto[:, -1:] - whole[:, -1:])
-        return _distributed(_of_exposures(cells, angles), angles, self.edge, self.level)
+        # a node of fan coordinates apart is as far as any: whatever rounding makes of equal panels
+        # changes nothing
+        apart = (self.edge - self.edge[:, :1]).abs().max() / (self.q[1] - self.q[0])
+        apart = min(apart.item(), 1.0)
+        return _distributed(_of_exposures(cells, angles), angles, self.edge, self.level, apart)
 
 
 def _distributed(
@@ -286,6 +290,7 @@ def _distributed(
     angles: Float[Tensor, " m"],
     edge: Float[Tensor, "q m"],
     level: Float[Tensor, "q m"],
+    apart: float,
 ) -> Float[Tensor, "q m"]:
     """Give the lines of each view's cell to the views near it, the more, the nearer they are and
     the farther from the edge of their panel.
@@ -297,9 +302,11 @@ def _distributed(
         cells: angles to be distributed, in radians.
         edge: distance of each view's lines from the edges of its panel.
         level: the greatest distance that counts in its cell.
+        apart: how far the panels of the views are apart, from 0 to 1: equal ones keep their cells.
     """
-    if (edge - edge[:, :1]).abs().max() < 1e-9 * edge.max():
-        return cells * (edge > 0)
+    own = cells * (edge > 0)
+    if apart < 1e-9:
+        return own
     edge, level = ((x / (PANEL_TAPER * edge.max())).clamp_max(1) for x in (edge, level))
     edge, level = (x.square() * (3 - 2 * x) for x in (edge, level))
     gaps = _gaps(angles)
@@ -323,7 +330,7 @@ def _distributed(
     cells, given = cells / total.clamp_min(1e-300), torch.zeros_like(cells)
     for shift in shifts:
         given += (cells * claims(shift)).roll(-shift, dims=1)
-    return given
+    return torch.lerp(own, given, apart)
 
 
 def _greatest(level: Float[Tensor, "q n"], reach: float) -> Float[Tensor, "q n"]:
@@ -364,7 +371,8 @@ def _covered(
     following = following.cummin(dim=1).values.flip(1)[:, : len(angles) + 1]
     index = torch.searchsorted(angles, places)
     left, right = places - last[:, index], following[:, index] - places
-    return (torch.minimum(left, right) <= usual / 2) | (left + right <= widest + 1e-9)
+    near = torch.minimum(left, right) <= usual / 2 + 1e-9
+    return near | (left + right <= widest + 1e-9)
 
 
 def _eroded(level: Float[Tensor, "q n"], step: float) -> Float[Tensor, "q n"]:
@@ -378,6 +386,14 @@ def _eroded(level: Float[Tensor, "q n"], step: float) -> Float[Tensor, "q n"]:
     left = places + (level - places).cummin(dim=1).values
     right = (level + places).flip(1).cummin(dim=1).values.flip(1) - places
     return torch.minimum(left, right)[:, count : 2 * count]
+
+
+def _raster(views: int, usual: float) -> int:
+    """The number of angles of the raster of lines: an even number in a usual step, so that cells of
+    evenly turned views begin and end between two of them, wherever rounding puts the views.
+    """
+    least, steps = max(MIN_ANGLES, ANGLES_PER_VIEW * views), round(FULL_TURN / usual)
+    return least if steps > least else steps * 2 * math.ceil(least / (2 * steps))
 
 
 def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:

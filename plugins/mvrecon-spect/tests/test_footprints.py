@@ -11,6 +11,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid, placed, voxel_centres
 from mvrecon.operators.selection import view_subset
+from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.projector import Spect
 
 FWHM = 2 * math.sqrt(2 * math.log(2))
@@ -279,6 +280,27 @@ def test_rounding_does_not_decide_whether_a_voxel_is_seen(dtype, backend):
     views.append(Spect(inner, pinhole(24, 200.0), blur=True, backend=backend)(x[..., :5]))
     for view in views[1:]:
         torch.testing.assert_close(view, views[0], rtol=1e-4, atol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_rounding_does_not_decide_whether_a_hole_accepts_a_ray(dtype, backend):
+    """Of voxels on the cone of 45 degrees, as those with sides 3, 4, 5; they are seen, as by a
+    little wider cone without further voxels. Thin rays through the centres of pixels, too.
+    """
+    grid = Grid.centred(11, spacing=4.0)
+    x = torch.rand(1, 1, *grid.shape, generator=torch.Generator().manual_seed(0)).to(dtype)
+    rigs = [pinhole(41, 164.0, 40.0, 40 + moved) for moved in (-1e-9, -3e-14, 0.0, 3e-14, 1e-9)]
+    narrower, wider = (
+        Spect(grid, rigs[0], acceptance_degrees=most, backend=backend)(x) for most in (44.95, 45.05)
+    )
+    scale = wider.max().item()
+    assert (wider - narrower).max() > 0.01 * scale
+    for rig in rigs:
+        view = Spect(grid, rig, acceptance_degrees=45.0, backend=backend)(x)
+        torch.testing.assert_close(view, wider, rtol=1e-5, atol=1e-5 * scale)
+        weights = [Hole(acceptance_degrees=most).weight(rig) for most in (45.0, 45.05)]
+        torch.testing.assert_close(*weights)
 
 
 def test_single_entries_of_forward_and_adjoint_are_the_same_numbers():

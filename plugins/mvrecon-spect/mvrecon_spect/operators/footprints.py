@@ -264,7 +264,7 @@ class Footprints(FixedGeometry):
         """The sensitivity of a pixel times the mean over lines; None with blur or attenuation."""
         if not self.clear or self.response != Response():
             return None
-        rays = ACROSS if pixel_in_voxels(self.cameras, self.grid) > 0.5 else 1
+        rays = ACROSS if pixel_in_voxels(self.cameras, self.grid) > 0.5 + 1e-6 else 1
         return PixelIntegral(self.hole.weight(self.cameras), rays)
 
 

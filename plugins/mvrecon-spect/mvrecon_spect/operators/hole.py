@@ -25,6 +25,8 @@ from mvrecon.geometry.cameras.camera import Cameras
 #: Upper bound of a collimator's linear attenuation in 1/mm above 70 keV (tungsten above its K edge:
 #: 22); lead and tungsten at 140.5 keV in 1/cm exceed it.
 DENSEST_EDGE = 25.0
+#: Tolerance of the cosine of the acceptance angle, above rounding to float32.
+ROUNDING = 1e-5
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,14 @@ class Hole:
         return tuple(math.sqrt(d * (d + 2 * self.rim) + more) for d in self.sides)
 
     @property
+    def least_cosine(self) -> float:
+        """Cosine of the greatest angle between an accepted ray and the axis; rays on the cone of
+        acceptance are accepted, whatever the rounding.
+        """
+        degrees = self.acceptance_degrees
+        return -1.0 if degrees is None else math.cos(math.radians(degrees)) - ROUNDING
+
+    @property
     def area_mm2(self) -> float:
         """Effective area for sensitivity, in mm^2."""
         width, height = self.effective_mm
@@ -132,9 +142,7 @@ class Hole:
         cosine = distance / (end - start).norm(dim=-1)
         area = torch.linalg.cross(cameras.u, cameras.v).norm(dim=-1)[:, None, None]
         weight = self.area_mm2 / (4 * math.pi) * cosine**4 * area / distance**2
-        if self.acceptance_degrees is None:
-            return weight
-        return weight * (cosine >= math.cos(math.radians(self.acceptance_degrees)))
+        return weight * (cosine >= self.least_cosine)
 
 
 def _is_size(size: object) -> bool:

@@ -204,8 +204,8 @@ def _least_cosine(cameras: Cameras, hole: Hole) -> float:
     """Cosine of the greatest angle between the axis and a pixel that the hole accepts."""
     start, end = cameras.rays()
     away = (end - start).detach().norm(dim=-1).amax(dim=(1, 2))
-    least = math.cos(math.radians(hole.acceptance_degrees or 90.0))
-    return min(max((cameras.distance.detach() / away).min().item(), least), 1 - 1e-6)
+    least = (cameras.distance.detach() / away).min().item()
+    return min(max(least, hole.least_cosine), 1 - 1e-6)
 
 
 def _powers(t: Float[Tensor, " n"], count: int) -> Float[Tensor, "n k"]:
@@ -429,8 +429,6 @@ def record_of(
     pitch = torch.stack([u.norm(dim=1), v.norm(dim=1)], dim=1)
     feet = torch.stack([_dot(foot, u), _dot(foot, v)], dim=1) / pitch**2
     area = hole.area_mm2 / (4 * math.pi)
-    degrees = hole.acceptance_degrees
-    least = -1.0 if degrees is None else math.cos(math.radians(degrees))
     every = torch.ones_like(length)[:, None]
     shape = (1 / 16, 1 / 256) if hole.round else (1 / 12, 1 / 120)
     record = [
@@ -438,7 +436,7 @@ def record_of(
         length[:, None],
         every * area * abs(float(torch.linalg.det(affine[:3, :3]))),
         secant,
-        every * least,
+        every * hole.least_cosine,
         feet,
         pitch / length[:, None],
         1 / pitch,
