@@ -91,10 +91,10 @@ def test_a_grid_of_a_part_of_the_object_is_named_where_the_method_needs_all_of_i
     assert checked(scan, "fdk", 0.8) == []
     (words,) = checked(scan, "sirt", 0.8)
     share = int(re.search(r"(\d+)% of the line integrals .* outside the grid", words)[1])
-    A = Drr(PARTS[name], RIG[:1])
+    A = Drr(PARTS[name], RIG)
     missed = A(torch.ones(1, 1, *A.domain_shape))[0, 0] == 0
-    beside = (views[:1] * missed).sum() / views[:1].sum()
-    assert share == pytest.approx(100 * beside.item(), abs=0.51)
+    beside = (views * missed).sum(dim=(1, 2)) / views.sum(dim=(1, 2))
+    assert share == pytest.approx(100 * beside.mean().item(), abs=1.51)
     aside = replace(scan, cameras=RIG.shifted(torch.tensor([[2.0, 0.0]])))
     (words,) = checked(aside, "fdk", 0.8)
     assert "-2.0 pixels aside along u" in words
