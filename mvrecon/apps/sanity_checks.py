@@ -4,6 +4,7 @@ its views.
 """
 
 import inspect
+import math
 import warnings
 from contextlib import suppress
 from dataclasses import replace
@@ -47,8 +48,8 @@ MAX_NRMSE_TO_NOISE = 1.25
 #: and twice as much as of so many times as many.
 MIN_SPARSE_SHARE, DENSER_FACTOR = 0.5, 4
 #: Share of the line integrals whose rays miss the grid, from which on the grid is too small to
-#: explain the views.
-MIN_BESIDE = 0.1
+#: explain the views, and how many views it is measured in.
+MIN_BESIDE, BESIDE_VIEWS = 0.1, 8
 #: An iterative method has not converged where a coarse SIRT explains the views and leaves less than
 #: this part of what it leaves.
 MAX_CONVERGED_SHARE = 0.5
@@ -137,10 +138,16 @@ def _sees_integrals(scan: Scan) -> bool:
 
 
 def _beside(seen: SomeViews) -> float:
-    """The share of the first view's line integrals in pixels whose rays miss the scan's grid."""
-    grid, cameras = seen.scan.grid, seen.scan.cameras[:1]
-    A = PROJECTORS.from_config(seen.scan.projector, grid=grid, cameras=cameras)
-    return share_beside(A, seen.first[None, None]).item()
+    """The share of the line integrals in pixels whose rays miss the scan's grid, in the mean over
+    some views: a long object may extend beyond it in one and not in another.
+    """
+    scan, total = seen.scan, 0.0
+    numbers = seen.numbers[:: math.ceil(len(seen.numbers) / BESIDE_VIEWS)]
+    for number in numbers.tolist():
+        cameras, views = scan.cameras[number : number + 1], scan.measured.read(number, number + 1)
+        A = PROJECTORS.from_config(scan.projector, grid=scan.grid, cameras=cameras)
+        total += share_beside(A, (views.views * views.mask)[None, None]).item()
+    return total / len(numbers)
 
 
 def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) -> str:

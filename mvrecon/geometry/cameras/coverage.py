@@ -142,7 +142,7 @@ def covering_pixels(cameras: Cameras, grid: Grid) -> tuple[float, float]:
     if not rig.valid(uvz).all():
         view = int((~rig.valid(uvz)).any(dim=1).nonzero()[0, 0])
         raise ValueError(
-            f"no detector of this rig sees the whole grid of {_box(grid)} mm: a part of its "
+            f"No detector of this rig sees the whole grid of {_box(grid)} mm: a part of its "
             f"inscribed cylinder lies behind the source or the detector of view {view}; increase "
             f"the distances, or take a smaller grid"
         )
@@ -277,7 +277,7 @@ def _advice(cameras: Cameras, grid: Grid) -> str:
     try:
         v, u = covering_pixels(cameras, grid)
     except ValueError as error:
-        return f"There is {error}"
+        return str(error)
     factor = max(v / rows, u / columns)
     pitch = [step.norm(dim=-1).median().item() for step in (cameras.v, cameras.u)]
     mm = " x ".join(f"{_rounded_up(factor * step):g}" for step in pitch)

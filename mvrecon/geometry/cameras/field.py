@@ -125,7 +125,7 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
             f"expected {seen_by:.0%} of the views to see the isocentre "
             f"{[round(mm, 3) for mm in centre.tolist()]} mm, got "
             f"{sees(rig, centre[None]).double().mean().item():.0%}; are detector offsets and axes "
-            f"right?"
+            f"right? Of a helix, say, take a smaller share (seen_by), or give the grid explicitly"
         )
     ends = torch.stack([rig.source, rig.detector_centre]) - centre
     high = torch.full_like(low, 2 * ends.norm(dim=-1).max().item())

@@ -8,6 +8,7 @@ centred on an error-free camera.
 Convention: shifts are those of `Misalignment.offset_px`: of the detector, along (u, v).
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -158,8 +159,8 @@ def _interpolation(shift: Float[Tensor, "#b #m"], count: int) -> Float[Tensor, "
 HUBER_THRESHOLD, REWEIGHTED_FITS = 1.345, 3
 #: Standard deviation in pixels of the blur before comparison.
 BLUR_SIGMA_PX = 1.0
-#: Block of pixels with correlated errors of an expected view.
-CORRELATED_PIXELS = 64.0
+#: Rows and columns of a block of pixels with correlated errors of an expected view.
+CORRELATED_PIXELS = 8
 #: Relative to the greatest value: pixels below are background, residuals below are rounding.
 MIN_CONTENT, MIN_RESIDUAL = 1e-3, 1e-6
 
@@ -203,6 +204,7 @@ def alignment(
         _columns(smooth).div(unit[:, 0]),
         counts.to(views.dtype)[:, 0].flatten(2),
         torch.cat([views.new_full((2,), prior.shift_px), views.new_full((1,), prior.gain)]).pow(-2),
+        math.prod(min(size, CORRELATED_PIXELS) for size in views.shape[-2:]),
     )
     for _ in range(steps):
         rest = (blurred(aligned(views, one), BLUR_SIGMA_PX) - smooth) / unit
@@ -217,11 +219,13 @@ class _ViewFit(NamedTuple):
         columns: derivatives by either shift, per pixel, and by the gain.
         weight: weight of each pixel.
         precision: precision of the prior, 1 / variance.
+        correlated: pixels of a block with correlated errors.
     """
 
     columns: Float[Tensor, "b m n 3"]
     weight: Float[Tensor, "b m n"]
     precision: Float[Tensor, " 3"]
+    correlated: int
 
     def step(self, rest: Float[Tensor, "b m n"], at: Alignment) -> Alignment:
         """One Gauss-Newton step, with weights from the remaining residual."""
@@ -234,7 +238,7 @@ class _ViewFit(NamedTuple):
             weight = self.weight * (
                 HUBER_THRESHOLD * scale / left.abs().clamp_min(MIN_RESIDUAL)
             ).clamp_max(1)
-            weighted = self.columns * (weight / (CORRELATED_PIXELS * scale**2))[..., None]
+            weighted = self.columns * (weight / (self.correlated * scale**2))[..., None]
             # the prior keeps it regular, so no check has to synchronise
             inverse = torch.linalg.inv_ex(weighted.mT @ self.columns + self.precision.diag())[0]
             slope = (weighted.mT @ rest[..., None])[..., 0] - self.precision * present

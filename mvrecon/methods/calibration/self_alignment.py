@@ -311,7 +311,8 @@ def _consistent(
     """
     kept = keep[:, None, :, None, None].to(views)
     part = _among(A, kept.expand_as(views), weights)
-    tried, rests, fits = kept * (gain != 1)[:, None, :, None, None], [], []
+    outlying = (gain.log().abs() > MIN_OUTLYING_LOG_GAIN)[:, None, :, None, None]
+    tried, rests, fits = kept * outlying, [], []
     for y in (views / gain[:, None, :, None, None], views):
         fits.append(A(sirt(A, y, ITERATIONS_FROM_ZERO, weights=part, momentum=True)))
         rest = fits[-1] - y
