@@ -132,12 +132,14 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
         )
     limit = max(field, reach)
     q = torch.linspace(-limit, limit, 2 * FAN_DISTANCES + 1, dtype=torch.float64)
-    angles, order = torch.deg2rad(orbit.angles).remainder(FULL_TURN).sort()
+    angles = torch.deg2rad(orbit.angles).remainder(FULL_TURN)
+    start = _start(angles)
+    angles, order = (angles - start).remainder(FULL_TURN).sort()
     edge = torch.minimum(q[:, None] - low[order], high[order] - q[:, None])  # [q m]
     branches = _Branches.of(angles, edge, q, cameras.parallel, min(field, reach))
     # values are those of voxels' centres, and between the angles of two views lines are theirs
     rim = orbit.cylinder(grid, margin=0.0)[0] * math.cos(_usual(_gaps(angles)) / 2)
-    missing = _Missing.of(branches, branches.measured, orbit, rim, offset)
+    missing = _Missing.of(branches, branches.measured, orbit, start, rim, offset)
     if missing.hole:
         raise ValueError(f"{missing}, which are inside others that are measured; use sirt")
     if missing.share > max_missing:
@@ -145,7 +147,8 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
             f"{missing}; expected at most {max_missing:.0%} (max_missing): are the angles right? "
             f"Else take a smaller grid, if the object lies within the field, or use sirt"
         )
-    bridged = _Missing.of(branches, branches.measured & branches.near, orbit, rim, offset)
+    near = branches.measured & branches.near
+    bridged = _Missing.of(branches, near, orbit, start, rim, offset)
     if bridged.worst > WARNED_MISSING:
         warnings.warn(
             f"{bridged}; expect errors of several per cent on these lines, of tens of per cent "
@@ -396,6 +399,16 @@ def _raster(views: int, usual: float) -> int:
     return least if steps > least else steps * 2 * math.ceil(least / (2 * steps))
 
 
+def _start(angles: Float[Tensor, " m"]) -> float:
+    """The angle behind the widest gap, from which results depend neither on the order of the views
+    nor on which of them is the first.
+    """
+    angles = angles.sort().values
+    gaps = _gaps(angles)
+    widest = int((gaps > gaps.max() - 1e-6).int().argmax())
+    return angles[(widest + 1) % len(angles)].item()
+
+
 def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
     """The gap behind each of sorted angles, around the circle."""
     return torch.cat([angles[1:], angles[:1] + FULL_TURN]) - angles
@@ -472,6 +485,7 @@ class _Missing:
         branches: _Branches,
         measured: Bool[Tensor, "q n"],
         orbit: Orbit,
+        start: float,
         radius: float,
         offset: Float[Tensor, "3"],
     ) -> "_Missing":
@@ -479,6 +493,7 @@ class _Missing:
 
         Args:
             measured: whether each of them is.
+            start: where the raster of angles starts, in radians after the first view.
             radius: radius of the cylinder, in mm.
             offset: vector from the isocentre to the cylinder, in mm.
         """
@@ -489,7 +504,7 @@ class _Missing:
         else:
             s, turn, density = orbit.radius * q.sin(), q, q.cos()
         # direction of the line's normal, in the orbit's plane, from the first view's tangent
-        beta = (torch.arange(count, dtype=torch.float64) + 0.5) * (FULL_TURN / count)
+        beta = start + (torch.arange(count, dtype=torch.float64) + 0.5) * (FULL_TURN / count)
         theta = beta - turn[:, None]
         tangent = torch.linalg.cross(orbit.axis, orbit.outwards[0])
         x, y = offset @ orbit.outwards[0], offset @ tangent

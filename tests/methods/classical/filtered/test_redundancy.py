@@ -239,6 +239,8 @@ TIES = {
     "half turn and its end": fan(FAN, [2.0 * k for k in range(91)]),
     "225 degrees": fan(FAN, [5.0 * k for k in range(46)]),
     "270 degrees": fan(FAN, [4.5 * k for k in range(61)]),
+    "200 degrees": fan(FAN, [200 / 239 * k for k in range(240)]),
+    "199 degrees": fan(FAN, [float(k) for k in range(200)]),
 }
 
 
