@@ -192,11 +192,14 @@ def _early(trainer: L.Trainer) -> list[EarlyStopping]:
 @contextmanager
 def report_checkpoint(last: Path) -> Iterator[None]:
     """Context that adds the path of the last good checkpoint to the error of an interrupted
-    training, including SIGTERM and Ctrl-C.
+    training, including SIGTERM and Ctrl-C. SIGTERM has Lightning's handler alone, which calls one
+    from before at once, and the training would end before it writes the checkpoint of that step.
 
     Raises:
         SystemExit: on SIGTERM or Ctrl-C, where Lightning would exit silently or with success.
     """
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL) if main else None
     try:
         yield
     except SIGTERMException as stop:
@@ -209,6 +212,9 @@ def report_checkpoint(last: Path) -> Iterator[None]:
         if last.exists() or previous(last).exists():
             error.add_note(_kept(last))
         raise
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _stop(*_: Any) -> None:
