@@ -165,7 +165,7 @@ def test_a_claim_removes_files_of_a_killed_writer(tmp_path):
 
 def test_a_full_disk_that_names_no_file_names_the_folder(tmp_path):
     """TensorBoard's writer raises the error of its thread, which names no file. Tried: trainings on
-    disks of 40, 100 and 200 KiB; each resumed to the bits of an undisturbed one when there was room.
+    disks of 40, 100 and 200 KiB, each resumed to the bits of an undisturbed one.
     """
     full = OSError(errno.ENOSPC, "No space left on device")
     full.add_note("the last checkpoint")

@@ -116,7 +116,8 @@ def _handled(terminate: Callable[[int, Any], None]) -> Iterator[None]:
     before = {
         number: signal.signal(number, handler)
         for name, handler in handlers.items()
-        if main and (number := getattr(signal, name, None))  # Windows has no SIGHUP
+        if main
+        and (number := getattr(signal, name, None))  # Windows has no SIGHUP
         and signal.getsignal(number) is signal.SIG_DFL
     }
     try:
