@@ -375,7 +375,7 @@ def report(table: dict[str, Any], folder: Path) -> None:
 
     lines = _figures(table, folder) if logger.isEnabledFor(logging.INFO) else []
     if table["stopped"] is not None:
-        lines.append(f"Ctrl-C: the volume is that of iteration {table['stopped']}")
+        lines.append(f"stopped: the volume is that of iteration {table['stopped']}")
     lines += [f"sanity check: {words}" for words in table["sanity_checks"]]
     for line in lines:
         Console(markup=False, highlight=False).print(line, soft_wrap=True)

@@ -12,7 +12,13 @@ from typing import Any, TypedDict
 import lightning.pytorch as L
 import numpy as np
 import torch
-from lightning.pytorch.callbacks import Checkpoint, EarlyStopping, EMAWeightAveraging, Timer
+from lightning.pytorch.callbacks import (
+    Checkpoint,
+    EarlyStopping,
+    EMAWeightAveraging,
+    ModelCheckpoint,
+    Timer,
+)
 from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
@@ -81,10 +87,31 @@ class KeepLast(Checkpoint):
             if isinstance(hook, Timer):
                 checkpoint["callbacks"].pop(hook.state_key, None)
 
+    def on_load_checkpoint(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: TrainingState
+    ) -> None:
+        """Find the files of `ModelCheckpoint` in a run folder that has moved: it would forget which
+        is the best, and replace it by the next one.
+        """
+        for hook in trainer.callbacks:  # pyrefly: ignore[missing-attribute]
+            state = checkpoint["callbacks"].get(hook.state_key)
+            if isinstance(hook, ModelCheckpoint) and state and state["dirpath"]:
+                moved = _moved(state, Path(state["dirpath"]), Path(hook.dirpath or self.path))
+                checkpoint["callbacks"][hook.state_key] = moved
+
     def _save(self, trainer: L.Trainer) -> None:
         for logger in trainer.loggers:  # else values that they hold back would be lost
             logger.save()
         trainer.save_checkpoint(self.path)
+
+
+def _moved(state: Any, before: Path, now: Path) -> Any:
+    """The state of a callback whose paths in one folder lead into another."""
+    if isinstance(state, dict):
+        return {_moved(k, before, now): _moved(v, before, now) for k, v in state.items()}
+    if isinstance(state, str) and Path(state).is_relative_to(before):
+        return str(now / Path(state).relative_to(before))
+    return state
 
 
 class AveragedWeights(EMAWeightAveraging):
@@ -192,11 +219,14 @@ def _early(trainer: L.Trainer) -> list[EarlyStopping]:
 @contextmanager
 def report_checkpoint(last: Path) -> Iterator[None]:
     """Context that adds the path of the last good checkpoint to the error of an interrupted
-    training, including SIGTERM and Ctrl-C.
+    training, including SIGTERM and Ctrl-C. SIGTERM has Lightning's handler alone, which calls one
+    from before at once, and the training would end before it writes the checkpoint of that step.
 
     Raises:
         SystemExit: on SIGTERM or Ctrl-C, where Lightning would exit silently or with success.
     """
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL) if main else None
     try:
         yield
     except SIGTERMException as stop:
@@ -209,6 +239,9 @@ def report_checkpoint(last: Path) -> Iterator[None]:
         if last.exists() or previous(last).exists():
             error.add_note(_kept(last))
         raise
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGTERM, before)
 
 
 def _stop(*_: Any) -> None:

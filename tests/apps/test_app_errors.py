@@ -1,6 +1,7 @@
 """A mistyped setting is answered in one line, with the nearest name, before torch is imported."""
 
 import re
+import signal
 import subprocess
 import sys
 import warnings
@@ -22,6 +23,7 @@ from mvrecon.apps.config import compose, conf_dir, launch
 from mvrecon.apps.config.errors import one_line, sentence
 from mvrecon.apps.settings import ReconstructSettings, TrainSettings
 from mvrecon.core import registry
+from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.options import check, fits
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.core.quantities import NonNegativeFloat, Pair, PositiveFloat, PositiveInt
@@ -469,6 +471,38 @@ def test_ctrl_c_ends_an_app_in_one_line(app: str, work: str, line, monkeypatch, 
     with pytest.raises(SystemExit, match="130"):
         module.main(line)
     assert capsys.readouterr().err == f"mvrecon-{app}: stopped by Ctrl-C\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
+@pytest.mark.parametrize("sent", ["SIGTERM", "SIGHUP"])
+def test_a_signal_ends_an_app_as_ctrl_c_does(sent, answer, monkeypatch, tmp_path):
+    """A scheduler's or a closed terminal's: what is half written is removed, the status is that of
+    a shell, and handlers of before are back. nohup's process goes on. Also tried: SIGINT, SIGTERM
+    and SIGHUP at random moments of mvrecon-simulate and -reconstruct in processes of their own.
+    """
+    number, file = signal.Signals[sent], tmp_path / "volume.nii.gz"
+    file.write_text("before")
+
+    def stop(config: object) -> None:
+        with written_whole(file) as part:
+            part.write_text("half")
+            signal.raise_signal(number)
+            part.write_text("whole")
+
+    usual = signal.signal(number, signal.SIG_DFL)
+    try:
+        # SIGHUP arrives as a SIGTERM
+        assert answer(task=stop) == "mvrecon-train: stopped by SIGTERM\n"
+        assert signal.getsignal(number) is signal.SIG_DFL
+        with pytest.raises(SystemExit, match="143"), one_line("mvrecon-view"):
+            signal.raise_signal(number)
+        assert file.read_text() == "before" and not [*tmp_path.rglob("*.part")]
+        signal.signal(number, signal.SIG_IGN)
+        with one_line("mvrecon-view"):
+            stop(None)
+    finally:
+        signal.signal(number, usual)
+    assert file.read_text() == "whole"
 
 
 def test_a_refused_command_leaves_no_folder(answer, tmp_path: Path):

@@ -96,6 +96,7 @@ def befall(what: str, n: int) -> None:
         "sync": (os, "fsync", kill),
         "rename": (os, "replace", kill),
         "term": (ReconstructionModule, "training_step", signalled(signal.SIGTERM)),
+        "hang up": (ReconstructionModule, "training_step", signalled(signal.SIGHUP)),
         "term of a job": (ReconstructionModule, "training_step", end_of_job),
         "term in validation": (ReconstructionModule, "validation_step", signalled(signal.SIGTERM)),
         "no space": (os, "fsync", raising(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))),

@@ -148,6 +148,24 @@ def test_a_first_validation_that_is_interrupted_is_repeated(tmp_path, monkeypatc
         assert [row["step"] for row in csv.DictReader(file) if row["val/psnr"]] == ["9"]
 
 
+def test_a_run_folder_that_has_moved_keeps_its_best_checkpoint(tmp_path, monkeypatch):
+    """The best validation is the first one. Lightning forgot it, and the next one replaced it."""
+    best = "_target_: lightning.pytorch.callbacks.ModelCheckpoint, dirpath: best, filename: best"
+    rule = "monitor: time/seconds, mode: min, enable_version_counter: false"
+    options = (f"trainer.max_steps={STEPS}", f"+callbacks.best={{{best}, {rule}}}")
+    settings = begun(tmp_path / "run", *options, "trainer.val_check_interval=3")
+    with monkeypatch.context() as patch:
+        step = ReconstructionModule.training_step
+        patch.setattr(ReconstructionModule, "training_step", step)
+        counted(ReconstructionModule, "training_step", 5, raising(MemoryError()))
+        with pytest.raises(MemoryError):
+            train(settings, tmp_path / "run")
+    (tmp_path / "run").rename(tmp_path / "moved")
+    train(settings, tmp_path / "moved")
+    assert checkpoints.read(tmp_path / "moved" / "best" / "best.ckpt")["global_step"] == 3
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("last", [5, 7])
 @pytest.mark.parametrize("whole", ["validated within epochs"], indirect=True)
 def test_a_run_stopped_in_its_last_step_can_be_extended(whole, last, tmp_path):

@@ -19,6 +19,11 @@ SINGLE = {
         "Stopped by SIGTERM. The last good checkpoint is",
         8,
     ),
+    "closed terminal": (
+        {"what": "hang up", "n": 8, "app": True},
+        "Stopped by SIGTERM. The last good checkpoint is",
+        8,
+    ),
     "judged": (
         {"what": "term in validation", "n": 3},
         "Stopped by SIGTERM. The last good checkpoint is",

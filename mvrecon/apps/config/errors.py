@@ -2,7 +2,9 @@
 
 import os
 import re
+import signal
 import sys
+import threading
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -54,6 +56,9 @@ def one_line(app: str) -> Iterator[None]:
     line. Of warnings that differ in their numbers alone, such as those of each step of a training,
     the first one is printed, and at the end how many followed.
 
+    SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C does: files that are
+    not complete are removed, and the status is 128 plus the number of the signal.
+
     Args:
         app: name of the app, with which the line begins.
 
@@ -62,6 +67,11 @@ def one_line(app: str) -> Iterator[None]:
     """
     traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
     given: Counter[tuple[str, ...]] = Counter()
+    stops = ["Ctrl-C", 128 + signal.SIGINT]
+
+    def terminate(number: int, _: object) -> None:
+        stops[:] = [signal.Signals(number).name, 128 + number]
+        raise KeyboardInterrupt
 
     def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> str:
         text = f"{app}: {category.__name__}: {message}\n"
@@ -72,10 +82,11 @@ def one_line(app: str) -> Iterator[None]:
     warnings.formatwarning = line
     os.environ[FULL_ERROR] = "1"  # Hydra's own report is several lines; so it raises the error
     try:
-        yield
+        with _handled(terminate):
+            yield
     except KeyboardInterrupt as stop:
-        sys.stderr.write(f"{app}: stopped by Ctrl-C\n")
-        raise SystemExit(130) from stop
+        sys.stderr.write(f"{app}: stopped by {stops[0]}\n")
+        raise SystemExit(stops[1]) from stop
     except (TaskFailed, *USER_ERRORS) as raised:
         error = raised.error if isinstance(raised, TaskFailed) else raised
         is_fault = isinstance(error, PROGRAM_FAULTS) and not isinstance(
@@ -95,6 +106,27 @@ def one_line(app: str) -> Iterator[None]:
             sys.stderr.write(f"{app}: warnings that repeat these with other numbers: {more}\n")
 
 
+@contextmanager
+def _handled(terminate: Callable[[int, Any], None]) -> Iterator[None]:
+    """Context in which SIGTERM has a handler and SIGHUP is a SIGTERM, unless they are handled or
+    ignored already, as by nohup.
+    """
+    handlers = {"SIGTERM": terminate, "SIGHUP": lambda *_: signal.raise_signal(signal.SIGTERM)}
+    main = threading.current_thread() is threading.main_thread()  # no other may set handlers
+    before = {
+        number: signal.signal(number, handler)
+        for name, handler in handlers.items()
+        if main
+        and (number := getattr(signal, name, None))  # Windows has no SIGHUP
+        and signal.getsignal(number) is signal.SIG_DFL
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 class TaskFailed(BaseException):
     """A task's error on its way through Hydra, which would print it."""
 
@@ -112,12 +144,14 @@ def reported(task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
     def run(config: DictConfig) -> Any:
         try:
             return task(config)
-        except Exception as error:
+        except BaseException as error:
             sweeps = HydraConfig.get().mode == RunMode.MULTIRUN
             own = [Path(HydraConfig.get().runtime.output_dir)] if sweeps else made
             with suppress(OSError):  # one of them holds something
                 for folder in own:
                     folder.rmdir()
+            if not isinstance(error, Exception):
+                raise
             if not sweeps:
                 raise TaskFailed(error) from error
             error.add_note(f"in the job {' '.join(as_typed(HydraConfig.get()))}")

@@ -1,5 +1,6 @@
 """Write files atomically, create new folders, and lock a folder for one process."""
 
+import errno
 import os
 import shutil
 import socket
@@ -16,6 +17,8 @@ except ImportError:  # Windows has no such locks: folders are not locked there
     fcntl = None
 
 LOCK_FILE, PART_ENDING = ".lock", ".part"
+#: Numbers of the errors of a full disk.
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
@@ -57,7 +60,7 @@ def naming(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if error.filename is None and error.errno is not None:
-            raise OSError(error.errno, error.strerror, str(path)) from error
+            error.filename = str(path)
         raise
 
 
@@ -149,7 +152,8 @@ def claimed(folder: Path) -> Iterator[None]:
     """Context that locks a folder for this process, and deletes incomplete files of killed
     processes in it.
 
-    The lock ends with the process, however that ends; worker processes do not inherit it.
+    The lock ends with the process, however that ends; worker processes do not inherit it. An error
+    of a full disk that names no file, as a logger's, names the folder.
 
     Raises:
         RuntimeError: another process holds the lock; the message names it.
@@ -172,7 +176,12 @@ def claimed(folder: Path) -> Iterator[None]:
         lock.flush()
         for part in [*folder.rglob(f".*.[0-9]*{PART_ENDING}")]:
             shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
-        yield
+        try:
+            yield
+        except OSError as error:
+            if error.filename is None and error.errno in FULL:
+                error.filename = str(folder)
+            raise
 
 
 def new_folder(path: str | Path) -> Path:

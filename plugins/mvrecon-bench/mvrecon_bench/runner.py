@@ -47,11 +47,12 @@ def run(bench: Bench, folder: Path, settings: dict[str, Any] | None = None) -> l
             f"another one by hydra.run.dir=..."
         )
     with claimed(folder):
+        table = Rows(folder / TABLE, columns, bench.keys)  # first: it marks the folder as its own
         if settings is not None:
             run_folder.start(folder, settings)
         versions = "".join(f"{name} {version}\n" for name, version in machine().items())
         run_folder.write(folder / run_folder.VERSIONS, versions)
-        table, board = Rows(folder / TABLE, columns, bench.keys), TensorBoard(str(folder))
+        board = TensorBoard(str(folder))
         groups = [[job for job in group if job.row not in table] for group in bench.groups()]
         bars = TextColumn("{task.description}"), BarColumn(16), MofNCompleteColumn()
         console = Console(stderr=True)

@@ -1,10 +1,12 @@
 """The table outlives crashes."""
 
 import math
+from typing import ClassVar
 
 import pytest
 
-from mvrecon_bench.rows import Rows, cell, value
+from mvrecon_bench import runner
+from mvrecon_bench.rows import Bench, Rows, cell, value
 
 COLUMNS, KEYS = ["part", "n", "ratio", "ms", "repeatable"], ["part", "n", "ratio"]
 
@@ -46,3 +48,32 @@ def test_cells_round_trip():
         and math.isnan(value(cell(math.nan)))
         and value("1e3x") == "1e3x"
     )
+
+
+class Empty(Bench):
+    """A benchmark without rows."""
+
+    columns: ClassVar = {"status": "ok"}
+    keys: ClassVar = ("status",)
+    charts, title, shown = (), "Nothing", {}
+
+    def groups(self):
+        return ()
+
+    def label(self, row):
+        return ""
+
+    def measure(self, jobs, rows, say):
+        yield from ()
+
+
+def test_a_benchmark_that_is_stopped_before_its_first_row_resumes(tmp_path, monkeypatch):
+    """It refused its own folder as another run's, which has settings and no table."""
+
+    def stop():
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(runner, "machine", stop)
+        runner.run(Empty(), tmp_path, {"bench": {}})
+    assert runner.run(Empty(), tmp_path, {"bench": {}}) == []
