@@ -103,7 +103,7 @@ class CrossView(nn.Module):
         widths: Sequence[int] = (16, 32, 64),
         depth_widths: Sequence[int] = (8, 16),
         weight_widths: Sequence[int] | None = None,
-        ray_widths: Sequence[int] = (16, 32, 64),
+        ray_widths: Sequence[int] = (8, 16, 32),
         features: int = 4,
         scale: int = 2,
         depths: int = 8,
