@@ -96,6 +96,9 @@ union all select printf('`world_unet` is %.1f dB ahead', lead) from clean
 union all select printf('at 128^3, forward is %.1f and adjoint %.1f times as fast as nanodrr', forward, adjoint) from gpu
 union all select printf('adjoint is %.1f times as fast as ASTRA''s', astra) from gpu
 union all select printf('to %.0e of the largest value, `siddon` to %.0e', max(largest) filter (where method != 'siddon'), max(largest) filter (where method = 'siddon')) from differences
+union all select printf('`geometry_free` is %.1f dB behind `world_unet`; a wrong arc costs %.1f dB', avg(psnr) filter (where method = 'world_unet' and arc = 180)
+  - avg(psnr) filter (where method = 'geometry_free'), avg(psnr) filter (where method = 'world_unet' and arc = 180) - avg(psnr) filter (where method = 'world_unet' and arc = 200))
+  from [experiments/24_geometry/results.csv] where steps = 800 and patients = 170
 union all select printf('to %.1f and %.1f %%', (select 100 * [difference from NumPy] from [experiments/25_measured/synchrotron.csv]),
   (select 100 * [difference from NumPy] from [experiments/25_measured/neutron.csv] where correction = 'found'))
 union all select printf('%.1f dB behind `cross_view` from robust SIRT', max(psnr) filter (where method like 'cross_view%') - max(psnr) filter (where method = 'dual_domain, narrow'))
