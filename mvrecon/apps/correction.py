@@ -19,7 +19,7 @@ from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
 from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import extended_to_field, resolution
+from mvrecon.geometry.cameras.field import extended_to_field, pixels_of_voxel
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.geometry.rigid import unit
@@ -300,10 +300,9 @@ def _joined(scan: Scan, grid: Grid) -> int:
     """Pixels joined into one each way: the most that a voxel's image holds and the detector has a
     multiple of.
     """
-    fitting = max(grid.spacing) / resolution(scan.cameras, grid.centre) + 1e-6
-    rows, columns = scan.cameras.shape
-    shared = math.gcd(rows, columns)
-    return max(n for n in range(1, shared + 1) if shared % n == 0 and (n == 1 or n <= fitting))
+    shared = math.gcd(*scan.cameras.shape)
+    most = min(shared, pixels_of_voxel(scan.cameras, grid))
+    return max(n for n in range(1, most + 1) if shared % n == 0)
 
 
 def _filled(whole: Corrected, joined: int, counts: bool) -> Float[Tensor, "1 1 m v u"]:

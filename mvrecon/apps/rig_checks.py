@@ -20,7 +20,7 @@ from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import auto_grid, extended_to_field, resolution
+from mvrecon.geometry.cameras.field import auto_grid, extended_to_field, pixels_of_voxel
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.methods.calibration.alignment import blurred
 from mvrecon.methods.classical.orbit import orbit_of
@@ -294,7 +294,7 @@ def coarse_grid(scan: Scan) -> Grid:
 
 def _region(scan: Scan, grid: Grid) -> Region:
     """Pixels of the size of a voxel's image."""
-    size = max(1, int(max(grid.spacing) / resolution(scan.cameras, grid.centre) + 1e-6))
+    size = pixels_of_voxel(scan.cameras, grid)
     rows, columns = scan.cameras.shape
     joined = (min(size, rows), min(size, columns))
     kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])

@@ -61,6 +61,15 @@ def train(settings, folder):
     fit.fit(lives.METHOD, settings, fit.build_data(settings), folder)
 
 
+def broken(settings, folder, step, call, happens=None, error=MemoryError):
+    """Train until a call of a step, in which something happens, an error by default."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ReconstructionModule, step, getattr(ReconstructionModule, step))
+        counted(ReconstructionModule, step, call, happens or raising(error()))
+        with pytest.raises(error):
+            train(settings, folder)
+
+
 def logged(folder):
     """The losses of a run by their steps."""
     with open(folder / "metrics.csv", newline="") as file:
@@ -93,7 +102,7 @@ def test_a_run_extended_from_any_step_is_one_of_the_whole_length(whole, request,
     assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
 
 
-def test_a_run_stopped_by_a_signal_or_an_error_resumes_exactly(whole, tmp_path, monkeypatch):
+def test_a_run_stopped_by_a_signal_or_an_error_resumes_exactly(whole, tmp_path):
     """SIGTERM in the last batch of an epoch, which is within an accumulation of three batches; then
     an error in the next epoch.
     """
@@ -103,17 +112,12 @@ def test_a_run_stopped_by_a_signal_or_an_error_resumes_exactly(whole, tmp_path, 
         (5, lives.signalled(signal.SIGTERM), SystemExit),
         (4, raising(MemoryError()), MemoryError),
     ):
-        with monkeypatch.context() as patch:
-            step = ReconstructionModule.training_step
-            patch.setattr(ReconstructionModule, "training_step", step)
-            counted(ReconstructionModule, "training_step", call, happens)
-            with pytest.raises(error):
-                train(settings, tmp_path / "run")
+        broken(settings, tmp_path / "run", "training_step", call, happens, error)
     train(settings, tmp_path / "run")
     assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
 
 
-def test_a_run_broken_in_epoch_after_epoch_resumes_exactly(whole, tmp_path, monkeypatch):
+def test_a_run_broken_in_epoch_after_epoch_resumes_exactly(whole, tmp_path):
     """Errors in the first batch of an epoch, of which the one before began after another error: its
     order of cases was that of the epoch before. Tried at random: 100 trainings with up to 11 breaks
     by errors, signals and time limits, in steps and validations, of 1 to 9 batches per epoch.
@@ -121,45 +125,30 @@ def test_a_run_broken_in_epoch_after_epoch_resumes_exactly(whole, tmp_path, monk
     options, expected = whole
     settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
     for call in (6, 6):
-        with monkeypatch.context() as patch:
-            step = ReconstructionModule.training_step
-            patch.setattr(ReconstructionModule, "training_step", step)
-            counted(ReconstructionModule, "training_step", call, raising(MemoryError()))
-            with pytest.raises(MemoryError):
-                train(settings, tmp_path / "run")
+        broken(settings, tmp_path / "run", "training_step", call)
     train(settings, tmp_path / "run")
     assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
 
 
-def test_a_first_validation_that_is_interrupted_is_repeated(tmp_path, monkeypatch):
+def test_a_first_validation_that_is_interrupted_is_repeated(tmp_path):
     """Validated every other epoch: the checkpoint at the end of a validated epoch is that after its
     validation.
     """
     options = ("+trainer.check_val_every_n_epoch=2", "trainer.val_check_interval=1.0")
     settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
-    with monkeypatch.context() as patch:
-        step = ReconstructionModule.validation_step
-        patch.setattr(ReconstructionModule, "validation_step", step)
-        counted(ReconstructionModule, "validation_step", 1, raising(MemoryError()))
-        with pytest.raises(MemoryError):
-            train(settings, tmp_path / "run")
+    broken(settings, tmp_path / "run", "validation_step", 1)
     train(settings, tmp_path / "run")
     with open(tmp_path / "run" / "metrics.csv", newline="") as file:
         assert [row["step"] for row in csv.DictReader(file) if row["val/psnr"]] == ["9"]
 
 
-def test_a_run_folder_that_has_moved_keeps_its_best_checkpoint(tmp_path, monkeypatch):
+def test_a_run_folder_that_has_moved_keeps_its_best_checkpoint(tmp_path):
     """The best validation is the first one. Lightning forgot it, and the next one replaced it."""
     best = "_target_: lightning.pytorch.callbacks.ModelCheckpoint, dirpath: best, filename: best"
     rule = "monitor: time/seconds, mode: min, enable_version_counter: false"
     options = (f"trainer.max_steps={STEPS}", f"+callbacks.best={{{best}, {rule}}}")
     settings = begun(tmp_path / "run", *options, "trainer.val_check_interval=3")
-    with monkeypatch.context() as patch:
-        step = ReconstructionModule.training_step
-        patch.setattr(ReconstructionModule, "training_step", step)
-        counted(ReconstructionModule, "training_step", 5, raising(MemoryError()))
-        with pytest.raises(MemoryError):
-            train(settings, tmp_path / "run")
+    broken(settings, tmp_path / "run", "training_step", 5)
     (tmp_path / "run").rename(tmp_path / "moved")
     train(settings, tmp_path / "moved")
     assert checkpoints.read(tmp_path / "moved" / "best" / "best.ckpt")["global_step"] == 3
@@ -174,13 +163,8 @@ def test_a_run_stopped_in_its_last_step_can_be_extended(whole, last, tmp_path):
     """
     (options, expected), folder = whole, tmp_path / "run"
     settings = begun(folder, f"trainer.max_steps={last}", *options)
-    with pytest.MonkeyPatch.context() as patch:
-        step = ReconstructionModule.training_step
-        patch.setattr(ReconstructionModule, "training_step", step)
-        terminate = lives.signalled(signal.SIGTERM)
-        counted(ReconstructionModule, "training_step", last, terminate)
-        with pytest.raises(SystemExit):
-            train(settings, folder)
+    terminate = lives.signalled(signal.SIGTERM)
+    broken(settings, folder, "training_step", last, terminate, SystemExit)
     train(settings, folder)
     train(lengthened(settings, folder, STEPS), folder)
     assert same(folder, expected) and logged(folder) == logged(expected)

@@ -159,8 +159,8 @@ def extended_to_field(cameras: Cameras, grid: Grid) -> Grid:
     except ValueError:  # of a rig without a common field
         return grid
     low, high = grid.to_index(field.corners()).aminmax(dim=0)
-    slack = max(field.spacing) / 2 / low.new_tensor(grid.spacing)
-    slack = slack + 1e-6  # above rounding
+    # above rounding
+    slack = max(field.spacing) / 2 / low.new_tensor(grid.spacing) + 1e-6
     before = (-0.5 - slack - low).ceil().clamp_min(0)
     after = (high - low.new_tensor(grid.size) + 0.5 - slack).ceil().clamp_min(0)
     affine = grid.affine.clone()
@@ -217,6 +217,13 @@ def resolution(cameras: Cameras, point: Float[Tensor, "3"]) -> float:
     if not cameras.parallel:
         pitch = pitch * (cameras.project(point)[:, 2] / cameras.distance).abs()
     return pitch.median().item()
+
+
+def pixels_of_voxel(cameras: Cameras, grid: Grid) -> int:
+    """Whole pixels that the image of a voxel at the grid's centre holds along its longest edge, one
+    at least; rounding does not decide them.
+    """
+    return max(1, int(max(grid.spacing) / resolution(cameras, grid.centre) + 1e-6))
 
 
 def check_rig_sees(cameras: Cameras, grid: Grid) -> Bool[Tensor, " m"]:
