@@ -28,10 +28,7 @@ BATCH, RANGE = 4, 0.04
 PATIENTS, HELD_OUT = 170, range(150, 170)
 GRID = mv.Grid.centred(size=(16, 16, 16), spacing=(32.0, 20.0, 24.0))
 DETECTOR = {"pixels": [24, 24], "pixel_mm": [36.0, 40.0]}
-HEADER = (
-    *("method", "seed", "steps", "rate", "patients", "arc"),
-    *("case", "psnr", "psnr_inside", "seconds"),
-)
+HEADER = "method,seed,steps,rate,patients,arc,case,psnr,psnr_inside,seconds".split(",")
 
 
 def rig(arc_degrees: float = 180.0) -> mv.Cameras:
@@ -48,7 +45,8 @@ def cases(
     scene = SCENES.build("hdf5", path=str(path), orientation="LPI", fine=2, rays=2, vary=vary)
     acquisition = Acquisition.of({"photons": float("inf"), "disturbed": faults})
     acquired = Acquired(scene, {"name": "drr"}, acquisition)
-    samples = [acquired.sample(i, seed, GRID, rig()) for i in indices]
+    cameras = rig()
+    samples = [acquired.sample(i, seed, GRID, cameras) for i in indices]
     parts = ([getattr(one, name) for one in samples] for name in ("views", "volume", "inside"))
     return tuple(map(torch.stack, parts))
 
@@ -114,7 +112,7 @@ def arguments() -> argparse.Namespace:
         "--arc",
         type=float,
         default=180.0,
-        help="arc in degrees of the cameras that methods are told; views have 180 (180)",
+        help="arc in degrees of the cameras that methods assume; views have 180 (180)",
     )
     parser.add_argument("--clean", action="store_true", help="views without faults")
     parser.add_argument(
