@@ -21,6 +21,8 @@ MAX_SETTLED_STEP, MAX_STEP = 0.01, 2.0
 #: Added to the variance of each bin, in mean counts: the volume's edge is not sharp enough for the
 #: weights of bins beside it that expect nothing.
 ADDED_VARIANCE = 0.1
+#: Least eigenvalue of the Fisher information relative to the greatest, far above rounding.
+MIN_EIGENVALUE = 1e-9
 #: Shifts of the eight octants of the activity show that it does not move as a whole where their
 #: chi^2, of 24 numbers, is above this (1 in 40,000 by chance), and one is above this part of a
 #: voxel, which discretisation may explain.
@@ -140,9 +142,10 @@ def _step(
     J, y, ybar = (part.flatten(1).double() for part in (slopes, counts, expected))
     weighted = J / (ybar + ADDED_VARIANCE * y.mean())
     fisher, score = weighted @ J.mT, weighted @ (y - ybar)[0]
-    if not y.any() or len(J) == 3 and torch.linalg.matrix_rank(fisher) < 3:
+    rank = torch.linalg.matrix_rank(fisher, hermitian=True, rtol=MIN_EIGENVALUE)
+    if not y.any() or len(J) == 3 and rank < 3:
         raise ValueError("Expected frames whose counts determine a shift along each axis")
-    covariance = torch.linalg.pinv(fisher, hermitian=True)
+    covariance = torch.linalg.pinv(fisher, hermitian=True, rtol=MIN_EIGENVALUE)
     step = covariance @ score
     return step, covariance.diagonal(), (score @ step).item()
 

@@ -103,7 +103,7 @@ def fit_linearisation(A: Projector, views: Float[Tensor, "1 1 m v u"]) -> Linear
     p, lengths = p[used], lengths[used]
     powers = p[:, None] ** torch.arange(1, DEGREE + 1)
     scale = powers.norm(dim=0)
-    found = torch.linalg.lstsq(powers / scale, lengths[:, None]).solution[:, 0] / scale
+    found = torch.linalg.lstsq(powers / scale, lengths[:, None], rcond=1e-9).solution[:, 0] / scale
     off[used] = powers @ found - lengths
     residual = (off.square().mean() / lengths.square().sum() * off.numel()).sqrt().item()
     fit = Linearisation((found / found[0]).tolist(), 1 / found[0].item(), residual)

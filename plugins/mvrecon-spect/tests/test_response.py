@@ -213,6 +213,27 @@ def test_widths_that_end_beside_the_detector_make_no_nan(tmp_path):
     assert moving.source.grad.isfinite().all() and moving.source.grad.any()
 
 
+@pytest.mark.parametrize("angle", [12.5, 15.0, 17.0, 20.0])
+def test_rounding_does_not_decide_the_terms_of_a_response(tmp_path, angle):
+    """Two depths at one angle off the axis determine the radial variances there alone, which then
+    differ from the tangential ones by tan^2: not by a rank that the last bit of an angle decides.
+    """
+    grid, rig, hole = Grid.centred(9, spacing=2.0, centre=(0, 0, 80)), pinhole(24, 48.0), Hole(2.3)
+    values = []
+    for _ in range(12):
+        rows = [(100, 0, 4, 4), (60, 0, 5, 5), (100, angle, 3.6, 3.2), (60, angle, 4.6, 4.2)]
+        values.append(measured(table(tmp_path / "psf.csv", *rows), hole, rig, grid).values)
+        angle = math.nextafter(angle, 90)
+    values = torch.tensor(values)
+    torch.testing.assert_close(values, values[:1].expand_as(values), rtol=1e-9, atol=1e-9)
+    response = measured(tmp_path / "psf.csv", hole, rig, grid)
+    assert not any(response.radial[2:])
+    for depth, difference in ((100, 3.6**2 - 3.2**2), (60, 4.6**2 - 4.2**2)):
+        radial = response.radial[0] + response.radial[1] * LENGTH / depth
+        tangent2 = math.tan(math.radians(angle)) ** 2
+        assert radial * tangent2 * FWHM**2 == pytest.approx(difference, rel=1e-9)
+
+
 @pytest.mark.parametrize("efficiency", [-1.0, 0.0, math.nan, math.inf])
 def test_tables_without_a_positive_fit_are_refused(tmp_path, efficiency):
     path = table(tmp_path / "psf.csv", (120, 0, 3, 3, efficiency), more=",efficiency")

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import text_of
@@ -66,6 +66,8 @@ ANGLES = 33
 #: Least difference of magnifications, relative to the greatest, and of angles in degrees, for a
 #: further term of a table's polynomials.
 MIN_STEP, MIN_STEP_DEGREES = 0.05, 3.0
+#: Least singular value of a fit's terms, relative to the greatest, far above rounding.
+MIN_SINGULAR = 1e-9
 #: Ratio of a grid's magnifications to those of a table from which a warning is given.
 MAX_EXTRAPOLATION = 1.25
 #: Points along each axis of a grid where a table's polynomials are evaluated.
@@ -220,7 +222,7 @@ def _terms(m: Float[Tensor, " n"], t: Float[Tensor, " n"]) -> Float[Tensor, "n 6
 
 def _least_squares(rows: Float[Tensor, "n k"], values: Float[Tensor, " n"]) -> Float[Tensor, " k"]:
     """Coefficients of the columns that fit values best."""
-    return torch.linalg.lstsq(rows, values[:, None]).solution[:, 0]
+    return torch.linalg.lstsq(rows, values[:, None], rcond=MIN_SINGULAR).solution[:, 0]
 
 
 def _polynomial(t: Tensor, values: Tensor, terms: int) -> Tensor:
@@ -267,7 +269,8 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
 
     Variances are fitted in l / depth and 1 - cos, by as many terms as there are depths and angles
     that differ by `MIN_STEP` and `MIN_STEP_DEGREES`, at most three and two; by fewer terms where a
-    fit is not positive at all voxels in a detector's field.
+    fit is not positive at all voxels in a detector's field. Sources off the axis alone determine
+    how radial variances differ from tangential ones.
 
     Args:
         path: a table with a row for each source: its distance `depth_mm` from the hole's plane and
@@ -298,21 +301,29 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
     depth, angle, radial, tangential = (columns[name] for name in TABLE)
     m, cosine = columns["distance_mm"] / depth, torch.deg2rad(angle).cos()
     t, tangent2 = 1 - cosine, 1 / cosine**2 - 1
-    depths, angles = (
-        _distinct(m, MIN_STEP * m.max().item()),
-        _distinct(angle.abs(), MIN_STEP_DEGREES),
-    )
     terms, field = _terms(m, t), seen_points(cameras, grid)
     _warn_of_depths(path, m, field.terms[:, 1])
 
+    def distinct(some: Bool[Tensor, " n"]) -> tuple[int, int]:
+        """The number of depths and of angles of some of the sources."""
+        depths = _distinct(m[some], MIN_STEP * m.max().item())
+        return depths, _distinct(angle[some].abs(), MIN_STEP_DEGREES)
+
+    # on the axis, radial is no direction
+    off_axis = angle.abs() >= MIN_STEP_DEGREES
+    depths, angles = distinct(torch.ones_like(off_axis))
+    radial_depths, radial_angles = distinct(off_axis)
+
     def widths(orders: tuple[int, int]) -> tuple[Tensor, Tensor]:
         """Coefficients of variances by so many terms of the depth and of the angle."""
-        used = [3 * j + i for j in range(orders[1]) for i in range(orders[0])]
         detector, smear = torch.zeros(2, 6, dtype=torch.float64)
+        used = _first_terms(*orders)
         detector[used] = _least_squares(terms[:, used], (tangential / FWHM) ** 2)
-        if angle.abs().max() >= MIN_STEP_DEGREES:  # on the axis, radial is no direction
-            rows = terms[:, used] * tangent2[:, None]
-            smear[used] = _least_squares(rows, (radial**2 - tangential**2) / FWHM**2)
+        if off_axis.any():
+            used = _first_terms(min(orders[0], radial_depths), min(orders[1], radial_angles))
+            rows = (terms[:, used] * tangent2[:, None])[off_axis]
+            difference = (radial**2 - tangential**2)[off_axis] / FWHM**2
+            smear[used] = _least_squares(rows, difference)
         return detector, smear
 
     orders = product(range(min(depths, 3), 0, -1), range(min(angles, 2), 0, -1))
@@ -328,6 +339,11 @@ def measured(path: Path, hole: Hole, cameras: Cameras, grid: Grid) -> Response:
         radial=tuple(smear.tolist()),
         efficiency=tuple(efficiency.tolist()),
     )
+
+
+def _first_terms(depths: int, angles: int) -> list[int]:
+    """Places in `_terms` of so many powers of the magnification, by so many of 1 - cos."""
+    return [3 * j + i for j in range(angles) for i in range(depths)]
 
 
 def _distinct(values: Float[Tensor, " n"], least: float) -> int:
