@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.rigid import unit
+from mvrecon.geometry.rigid import rotation_by, unit
 
 #: Greatest deviation of sources (relative to the radius) and of directions from the orbit.
 MAX_ORBIT_DEVIATION = 0.05
@@ -75,9 +75,7 @@ class Orbit:
 
     def turned(self, cameras: Cameras, degrees: Float[Tensor, " m"]) -> Cameras:
         """Turn each camera about the axis by its own angle."""
-        x, y, z = self.axis.tolist()
-        about = self.axis.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        R = torch.linalg.matrix_exp(about * degrees.deg2rad().to(about)[:, None, None])
+        R = rotation_by(self.axis * degrees.deg2rad().to(self.axis)[:, None])
 
         def by(vectors: Tensor) -> Tensor:
             return (R @ vectors[..., None])[..., 0]
