@@ -330,7 +330,9 @@ class Composed(nn.Module, Derived):
         super().__init__()
         if S.domain_shape != A.range_shape:
             shapes = f"{S.domain_shape} and {A.range_shape}"
-            raise ValueError(f"Expected S's domain to be A's range for the product S A, got {shapes}")
+            raise ValueError(
+                f"Expected S's domain to be A's range for the product S A, got {shapes}"
+            )
         self.S, self.A = S, A
         self.domain_shape, self.range_shape = A.domain_shape, S.range_shape
 

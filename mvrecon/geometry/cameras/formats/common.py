@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import Refused, check_file, file_errors, shown, text_of
 from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.core.registry import hint
@@ -228,8 +228,7 @@ def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Ten
 def save_lines(path: str | Path, head: str, rows: Iterable[Iterable[float]], comma: str) -> None:
     """Write rows of numbers under a header line atomically, in full precision."""
     lines = [comma.join(repr(float(value)) for value in row) for row in rows]
-    with written_whole(path) as part:
-        part.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([head, *lines]) + "\n")
 
 
 def check_degrees(degrees: list[float], insist: bool, what: str) -> None:

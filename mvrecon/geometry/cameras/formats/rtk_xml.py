@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.core.files.keys import Key
 from mvrecon.geometry.cameras.camera import Cameras
@@ -274,8 +274,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
     for view, gantry, (_, out, inner) in zip(views, gantries, angles, strict=True):
         degrees = gantry, math.degrees(out), math.degrees(inner)
         lines += ["  <Projection>", *_view(*view, degrees), "  </Projection>"]
-    with written_whole(path) as part:
-        part.write_text("\n".join([*lines, "</RTKThreeDCircularGeometry>\n"]), encoding="utf-8")
+    write_text(path, "\n".join([*lines, "</RTKThreeDCircularGeometry>\n"]))
 
 
 def check(cameras: Cameras) -> None:

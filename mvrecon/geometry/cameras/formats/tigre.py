@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import Refused, file_errors, json_of, shown
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.core.registry import hint
@@ -238,5 +238,4 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
         "offOrigin": (-(R @ aside[..., None])[..., 0]).flip(-1).tolist(),
         "angles": torch.deg2rad(euler_degrees(R)).tolist(),
     }
-    with written_whole(path) as part:
-        part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(record, indent=1) + "\n")
