@@ -234,9 +234,8 @@ def _cameras(table: Float[Tensor, "m 9"], plate: Detector) -> Cameras:
         )
     if parallel:  # its length is that of a direction
         sid = torch.where(sid == 0, 1.0, sid)
-    for near, far in zip(sid.tolist(), sdd.tolist(), strict=True):
-        if not parallel:
-            common.check_distances(near, far)
+    else:
+        common.check_distances(sid, sdd)
     axes = _axes(table)
     looking = axes * axes.new_tensor([1, -1, -1])[:, None]
     source = torch.stack([x if parallel else source_x, y if parallel else source_y, sid], dim=-1)
@@ -264,9 +263,8 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
     source, centre = (
         (axes * point[:, None]).sum(dim=-1) for point in (rig.source, rig.detector_centre)
     )
+    common.check_distances(source[:, 2], source[:, 2] - centre[:, 2])
     views = list(zip(axes.tolist(), source.tolist(), centre.tolist(), strict=True))
-    for _, start, end in views:
-        common.check_distances(start[2], start[2] - end[2])
     angles = [gantry_angles(view[0]) for view in views]
     gantries = common.unmistakable([math.degrees(angle[0]) for angle in angles])
     lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>"]
@@ -279,8 +277,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
 
 def check(cameras: Cameras) -> None:
     """Raise ValueError for a rig that `write` refuses."""
-    if cameras.parallel or cameras.extent != "segment":
-        raise ValueError("expected X-ray cone beams for RTK's XML, got another rig")
+    common.check_cone(cameras, "RTK's XML")
     common.square_pixels(cameras, "RTK")
 
 
