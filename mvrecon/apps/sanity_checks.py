@@ -22,7 +22,7 @@ from mvrecon.apps.rig_checks import (
 )
 from mvrecon.apps.run_method import Method, Outcome
 from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory, of_one_view
-from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.core.parts import METHODS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import MeasuredViews
 from mvrecon.geometry.grid import coarse
@@ -141,7 +141,7 @@ def _beside(seen: SomeViews) -> float:
     numbers = seen.numbers[:: math.ceil(len(seen.numbers) / BESIDE_VIEWS)]
     for number in numbers.tolist():
         cameras, views = scan.cameras[number : number + 1], scan.measured.read(number, number + 1)
-        A = PROJECTORS.from_config(scan.projector, grid=scan.grid, cameras=cameras)
+        A = scan.on(scan.grid, cameras)
         total += share_beside(A, (views.views * views.mask)[None, None]).item()
     return total / len(numbers)
 
@@ -173,7 +173,7 @@ def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) ->
         warnings.simplefilter("ignore")  # the method has given its own
         grid = coarse(scan.grid, SLICE_VOXELS)
         seen = SomeViews.of(scan, grid, device)
-        A = PROJECTORS.from_config(scan.projector, grid=grid, cameras=seen.cameras).to(device)
+        A = scan.on(grid, seen.cameras).to(device)
         x = sirt(A, seen.views, SEARCH_ITERATIONS, momentum=True)
         left = nrmse(A(x), seen.views)
         if "iterations" in inspect.signature(module.solve).parameters and (
@@ -188,10 +188,7 @@ def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) ->
         turns = (step.expand(len(A.cameras)) * k / DENSER_FACTOR for k in range(DENSER_FACTOR))
         rig = joined_cameras([orbit.turned(A.cameras, turn) for turn in turns])
         rig = rig[torch.arange(len(rig)).view(DENSER_FACTOR, -1).T.flatten()]  # in their order
-        few, many = (
-            nrmse(B(module(B(x), B).volume), B(x))
-            for B in (A, PROJECTORS.from_config(scan.projector, grid=A.grid, cameras=rig))
-        )
+        few, many = (nrmse(B(module(B(x), B).volume), B(x)) for B in (A, scan.on(A.grid, rig)))
         if few > max(MIN_SPARSE_SHARE * view_nrmse, 2 * many):
             return (
                 f"{method.name} of {len(scan.cameras)} views leaves {few:.2g} of views that fit "

@@ -108,14 +108,17 @@ class Scan:
     rig: Cameras | None = None
     parts: tuple["Scan", ...] = ()
 
+    def on(self, grid: Grid, cameras: Cameras) -> Projector:
+        """The projector on any grid by any cameras, without the pixels' factors."""
+        return PROJECTORS.from_config(self.projector, grid=grid, cameras=cameras)
+
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of consecutive ones, with the pixels' factors."""
         if self.parts:
             A: Any = Stacked([replace(part, factors=None).operator() for part in self.parts])
             A = A.subset(ViewSelection(A.range_shape, range(len(self.cameras))[views]))
         else:
-            cameras = self.cameras[views]
-            A = PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
+            A = self.on(self.grid, self.cameras[views])
         return A if self.factors is None else Scaled(A, pixels=self.factors[views])
 
     def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:
@@ -437,8 +440,7 @@ def check_unit(unit: str, name: str, A: Projector) -> None:
 
 def of_one_view(scan: Scan, view: int = 0) -> Projector:
     """The operator of a view on a coarse grid, which tells what a scan's pixels are."""
-    one = scan.cameras[view : view + 1]
-    return PROJECTORS.from_config(scan.projector, grid=coarse(scan.grid, 2), cameras=one)
+    return scan.on(coarse(scan.grid, 2), scan.cameras[view : view + 1])
 
 
 def _detector(measured: MeasuredViews) -> dict[str, tuple]:
