@@ -20,7 +20,7 @@ from rich.console import Console
 
 from mvrecon.apps.command_line import command_line
 from mvrecon.apps.config.errors import one_line
-from mvrecon.core.files.atomic import check_writable, written_whole
+from mvrecon.core.files.atomic import check_writable, write_text
 from mvrecon.core.files.runs import RESULTS
 from mvrecon.core.registry import hint
 from mvrecon.report import comparison
@@ -70,8 +70,7 @@ def compare(
             comparison.picture(rows, metric),
         )
         for name, text in zip(TABLE_FILES, texts, strict=True):
-            with written_whole(Path(out) / name) as part:
-                part.write_text(text, encoding="utf-8")
+            write_text(Path(out) / name, text)
     return table
 
 

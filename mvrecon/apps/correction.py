@@ -15,7 +15,6 @@ from torch import Tensor
 from mvrecon.apps.progress import Bar
 from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.machine import check_memory
-from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import binned
 from mvrecon.data.projections.views import Corrected, MeasuredViews
 from mvrecon.geometry.cameras.camera import Cameras
@@ -147,7 +146,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     cut, box = cut_sides(pixels), _grid_about(about, pixels.to(device))
 
     def operator_of(grid, cameras):
-        return PROJECTORS.from_config(scan.projector, grid=grid, cameras=cameras).to(device)
+        return scan.on(grid, cameras).to(device)
 
     box = _grown(box) if cut.all(dim=-1).any() else box
     grid = coarse(box, MAX_GRID_VOXELS)
@@ -282,9 +281,7 @@ def calibration_table(estimate: Estimate, free: Sequence[str]) -> dict[str, Any]
 
 def _grid_about(scan: Scan, pixels: Float[Tensor, "1 1 m v u"]) -> Grid:
     """The scan's grid, or the field of half of its views where the object extends beyond it."""
-    A = PROJECTORS.from_config(
-        scan.projector, grid=coarse(scan.grid, MAX_GRID_VOXELS), cameras=scan.cameras
-    )
+    A = scan.on(coarse(scan.grid, MAX_GRID_VOXELS), scan.cameras)
     beside = share_beside(A.to(pixels.device), pixels).item()
     return extended_to_field(scan.cameras, scan.grid) if beside > MAX_BESIDE else scan.grid
 

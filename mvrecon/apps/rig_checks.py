@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mvrecon.apps.scan import Scan
 from mvrecon.core.numbers import SIGMA_PER_MEDIAN, second_differences
-from mvrecon.core.parts import PROJECTORS
 from mvrecon.data.projections.stack import Region
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import auto_grid, extended_to_field, pixels_of_voxel
@@ -249,8 +248,7 @@ class SomeViews(NamedTuple):
         exchanged, reversed_axes = order
         y, mask = (x.mT if exchanged else x for x in (self.views, self.mask))
         y, mask = (x.flip(reversed_axes).contiguous() for x in (y, mask))
-        A = PROJECTORS.from_config(self.scan.projector, grid=self.grid, cameras=cameras)
-        A = A.to(y.device)
+        A = self.scan.on(self.grid, cameras).to(y.device)
         A = A if mask.all() else Scaled(A, pixels=mask)
         rest = A(sirt(A, y, iterations, momentum=True)) - y
         squares = rest.double().square().sum(dim=(0, 1, 3, 4)).cpu()

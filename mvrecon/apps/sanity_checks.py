@@ -7,8 +7,6 @@ import inspect
 import math
 import warnings
 from contextlib import suppress
-from dataclasses import replace
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,18 +15,16 @@ from torch import Tensor
 from mvrecon.apps.rig_checks import (
     SEARCH_ITERATIONS,
     SLICE_VOXELS,
-    VOLUME_VOXELS,
     SomeViews,
     better_rig,
     coarse_grid,
     noise_of,
 )
 from mvrecon.apps.run_method import Method, Outcome
-from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory
-from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.apps.scan import ATTENUATION, Scan, ViewsInMemory, of_one_view
+from mvrecon.core.parts import METHODS
 from mvrecon.data.attenuation import WATER
 from mvrecon.data.projections.views import MeasuredViews
-from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.grid import coarse
 from mvrecon.methods.calibration.self_alignment import share_beside
 from mvrecon.methods.classical.fdk import fbp, fdk
@@ -36,6 +32,7 @@ from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.method import Solver
 from mvrecon.operators.operator import sees_integrals
+from mvrecon.operators.stacked import joined_cameras
 from mvrecon.report.metrics import nrmse
 
 #: Attenuation relative to water's, above that of any matter at 60 keV, where lead has 300.
@@ -130,11 +127,10 @@ def sanity_checks(
 
 
 def _sees_integrals(scan: Scan) -> bool:
-    """Whether the projector takes plain line integrals, by one of a view on a coarse grid."""
-    grid, camera = coarse(scan.grid, VOLUME_VOXELS), scan.cameras[:1]
+    """Whether the projector takes plain line integrals."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the operator of the reconstruction gives these warnings
-        return sees_integrals(PROJECTORS.from_config(scan.projector, grid=grid, cameras=camera))
+        return sees_integrals(of_one_view(scan))
 
 
 def _beside(seen: SomeViews) -> float:
@@ -145,7 +141,7 @@ def _beside(seen: SomeViews) -> float:
     numbers = seen.numbers[:: math.ceil(len(seen.numbers) / BESIDE_VIEWS)]
     for number in numbers.tolist():
         cameras, views = scan.cameras[number : number + 1], scan.measured.read(number, number + 1)
-        A = PROJECTORS.from_config(scan.projector, grid=scan.grid, cameras=cameras)
+        A = scan.on(scan.grid, cameras)
         total += share_beside(A, (views.views * views.mask)[None, None]).item()
     return total / len(numbers)
 
@@ -177,7 +173,7 @@ def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) ->
         warnings.simplefilter("ignore")  # the method has given its own
         grid = coarse(scan.grid, SLICE_VOXELS)
         seen = SomeViews.of(scan, grid, device)
-        A = PROJECTORS.from_config(scan.projector, grid=grid, cameras=seen.cameras).to(device)
+        A = scan.on(grid, seen.cameras).to(device)
         x = sirt(A, seen.views, SEARCH_ITERATIONS, momentum=True)
         left = nrmse(A(x), seen.views)
         if "iterations" in inspect.signature(module.solve).parameters and (
@@ -190,16 +186,9 @@ def _cause(seen: SomeViews, method: Method, view_nrmse: float, beside: float) ->
         orbit = orbit_of(A.cameras, A.grid)
         step = (torch.remainder(orbit.angles.diff() + 180, 360) - 180).mean()
         turns = (step.expand(len(A.cameras)) * k / DENSER_FACTOR for k in range(DENSER_FACTOR))
-        rigs = [orbit.turned(A.cameras, turn) for turn in turns]
-        dense: dict[str, Any] = {
-            name: torch.stack([getattr(rig, name) for rig in rigs], dim=1).flatten(0, 1)
-            for name in VECTORS
-        }
-        rig = replace(A.cameras, **dense)
-        few, many = (
-            nrmse(B(module(B(x), B).volume), B(x))
-            for B in (A, PROJECTORS.from_config(scan.projector, grid=A.grid, cameras=rig))
-        )
+        rig = joined_cameras([orbit.turned(A.cameras, turn) for turn in turns])
+        rig = rig[torch.arange(len(rig)).view(DENSER_FACTOR, -1).T.flatten()]  # in their order
+        few, many = (nrmse(B(module(B(x), B).volume), B(x)) for B in (A, scan.on(A.grid, rig)))
         if few > max(MIN_SPARSE_SHARE * view_nrmse, 2 * many):
             return (
                 f"{method.name} of {len(scan.cameras)} views leaves {few:.2g} of views that fit "

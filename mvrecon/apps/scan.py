@@ -37,7 +37,7 @@ from mvrecon.geometry.cameras.field import auto_grid, check_rig_sees, full_fan
 from mvrecon.geometry.cameras.formats.common import flips_rows
 from mvrecon.geometry.cameras.formats.rtk_xml import detector_of_image
 from mvrecon.geometry.cameras.rigs import Detector
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, sees_integrals
 from mvrecon.operators.selection import ViewSelection
 from mvrecon.operators.stacked import Stacked
@@ -108,14 +108,17 @@ class Scan:
     rig: Cameras | None = None
     parts: tuple["Scan", ...] = ()
 
+    def on(self, grid: Grid, cameras: Cameras) -> Projector:
+        """The projector on any grid by any cameras, without the pixels' factors."""
+        return PROJECTORS.from_config(self.projector, grid=grid, cameras=cameras)
+
     def operator(self, views: slice = slice(None)) -> Projector:
         """The operator of all views, or of consecutive ones, with the pixels' factors."""
         if self.parts:
             A: Any = Stacked([replace(part, factors=None).operator() for part in self.parts])
             A = A.subset(ViewSelection(A.range_shape, range(len(self.cameras))[views]))
         else:
-            cameras = self.cameras[views]
-            A = PROJECTORS.from_config(self.projector, grid=self.grid, cameras=cameras)
+            A = self.on(self.grid, self.cameras[views])
         return A if self.factors is None else Scaled(A, pixels=self.factors[views])
 
     def posed(self, device: str) -> tuple[LinearOperator, Float[Tensor, "1 1 m v u"]]:
@@ -249,7 +252,7 @@ def open_scan(
     )
     scan = Scan(measured, cameras, voxels, projector, rig=rig)
     unit = measured.stack.unit
-    A = _coarse(scan, seeing)
+    A = of_one_view(scan, seeing)
     if unit is not None:
         check_unit(unit, projector["name"], A)
     stated = measured.kind == "counts" or (unit or "").endswith(f" of {EMISSION}")
@@ -435,14 +438,9 @@ def check_unit(unit: str, name: str, A: Projector) -> None:
         )
 
 
-def _coarse(scan: Scan, view: int) -> Projector:
-    """The operator of a view of 2 x 2 x 2 voxels in the grid's box."""
-    affine = scan.grid.affine.clone()
-    affine[:3, :3] *= torch.tensor(scan.grid.size, dtype=affine.dtype) / 2
-    affine[:3, 3] = scan.grid.centre - affine[:3, :3].sum(dim=1) / 2
-    blocks = Grid((2, 2, 2), affine)
-    one = scan.cameras[view : view + 1]
-    return PROJECTORS.from_config(scan.projector, grid=blocks, cameras=one)
+def of_one_view(scan: Scan, view: int = 0) -> Projector:
+    """The operator of a view on a coarse grid, which tells what a scan's pixels are."""
+    return scan.on(coarse(scan.grid, 2), scan.cameras[view : view + 1])
 
 
 def _detector(measured: MeasuredViews) -> dict[str, tuple]:

@@ -20,7 +20,7 @@ import yaml
 
 from mvrecon.apps.config.grammar import as_text
 from mvrecon.apps.settings import ReconstructSettings
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import (
     MAX_YAML_BYTES,
     Refused,
@@ -65,8 +65,7 @@ def save(file: Path, description: Mapping[str, Mapping[str, Any] | None]) -> Non
     """
     told = {key: dict(value) for key, value in description.items() if value is not None}
     told = with_paths(told, ReconstructSettings, partial(_from_folder, file.parent))
-    with written_whole(file) as part:
-        part.write_text(yaml.safe_dump(told, sort_keys=False), encoding="utf-8")
+    write_text(file, yaml.safe_dump(told, sort_keys=False))
 
 
 def _from_folder(folder: Path, path: str, marks: tuple) -> str:

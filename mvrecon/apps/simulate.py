@@ -99,31 +99,31 @@ def simulate(settings: SimulateSettings, folder: Path) -> list[Path]:
             name, mu = export.numbered(case.name, case_folders), case.maps.get("mu")
             attenuated = takes_mu and bool(projector.get("mu") if mu is None else mu.any())
             views, counted = case.views[0], (case.dose, acquisition.duration_s)
-            case_folders.append(export.save_views(where, name, views, unit, attenuated, *counted))
+            own = export.save_views(where, name, views, unit, attenuated, *counted)
+            case_folders.append(own)
             if settings.picture:
                 image = review.mosaic(views, name, unit)
-                images.save_png(case_folders[-1] / "mosaic.png", image)
+                images.save_png(own / "mosaic.png", image)
             else:
                 top = max(views.amax().item(), torch.finfo(torch.float32).tiny)
                 for m, view in enumerate(views):
                     image = images.grey(view, (0, top))  # black at 0
-                    images.save_png(case_folders[-1] / f"view_{m:03d}.png", image)
+                    images.save_png(own / f"view_{m:03d}.png", image)
             description = {
-                "views": {"path": str(case_folders[-1] / "views.h5")},
+                "views": {"path": str(own / "views.h5")},
                 "camera": {"name": "from_file", "path": str(folder / run_folder.RIG)},
                 "projector": settings.projector and dict(settings.projector),
                 "grid": dict(settings.grid),
             }
-            scan_file.save(case_folders[-1] / scan_file.NAME, description)
+            scan_file.save(own / scan_file.NAME, description)
             if settings.rtk:
-                export.save_greys(where, name, views)
+                export.save_greys(own, views)
             if nibabel:
-                export.save_truth(where, name, case.volume[0], grid, scene.unit)
-                if mu is not None:
-                    export.save_mu(where, name, mu[0], grid)
+                mu = None if mu is None else mu[0]
+                export.save_truth(own, case.volume[0], scene.unit, grid, mu)
             placement = scene.scene.placement(index, settings.seed, grid)
             if placement is not None:
-                export.save_placement(where, name, placement)
+                export.save_placement(own, placement)
     return case_folders
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mvrecon.apps.command_line import command_line
 from mvrecon.apps.config.errors import one_line
-from mvrecon.core.files.atomic import check_writable, written_whole
+from mvrecon.core.files.atomic import check_writable, write_text
 from mvrecon.core.files.checks import from_home
 
 #: What can be seen first; `viz.page` makes all of them.
@@ -51,8 +51,7 @@ def view(
     rig = None if cameras is None else from_file(from_home(cameras))
     values, grid = read_volume(path)
     text = page(values, grid, rig, window, first, name_of(path))
-    with written_whole(place) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(place, text)
     return place
 
 

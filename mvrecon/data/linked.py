@@ -47,7 +47,6 @@ class Place(NamedTuple):
 def followed(
     path: Path,
     name: str,
-    expected: str,
     folder: Path | None = None,
     links: tuple[Place, ...] = (),
 ) -> Place | None:
@@ -59,7 +58,6 @@ def followed(
     Args:
         path: path of the file.
         name: name in the file, such as "/entry/data/data".
-        expected: what should be there, for messages.
         folder: other files must be in it, or below; None: that of `path`.
         links: the links that were followed before.
 
@@ -69,7 +67,7 @@ def followed(
     """
     folder = path.parent.resolve() if folder is None else folder
     parts, done = [part for part in name.split("/") if part not in ("", ".")], []
-    with opened(path, expected) as file:
+    with opened(path) as file:
         here: h5py.HLObject = file
         for k, part in enumerate(parts):
             link = here.get(part, getlink=True) if isinstance(here, h5py.Group) else None
@@ -90,7 +88,7 @@ def followed(
             else:
                 own = "" if link.path.startswith("/") else "/".join(done)
                 target = f"{own}/{link.path}"
-            return followed(path, f"{target}/{rest}", expected, folder, links)
+            return followed(path, f"{target}/{rest}", folder, links)
     return Place(path, "/" + "/".join(done), links)
 
 
@@ -112,19 +110,19 @@ def beside(path: Path, other: str, name: str, folder: Path) -> Path:
 
 def address(place: Place) -> tuple[Path, int]:
     """File and address of an object, equal for all of its names there."""
-    with opened(place.path, "HDF5") as file:
+    with opened(place.path) as file:
         info = h5py.h5o.get_info(file[place.name].id)  # type: ignore[attr-defined]
         return place.path.resolve(), info.addr
 
 
-def check_around(place: Place, expected: str) -> None:
+def check_around(place: Place) -> None:
     """Check the groups in which a data set and the links to it are, as `check_attributes` does.
 
     Raises:
         Refused: an attribute of a group, or a field in it, that scales the data set.
     """
     for path, name, _ in (place, *place.links):
-        with opened(path, expected) as file:
+        with opened(path) as file:
             group: h5py.Group = file
             for part in name.strip("/").split("/"):
                 check_attributes(path, group)
@@ -133,37 +131,36 @@ def check_around(place: Place, expected: str) -> None:
                     group = group[part]  # type: ignore[assignment]
 
 
-def values_at(place: Place, expected: str, known: tuple[str, ...] = ()) -> np.ndarray:
+def values_at(place: Place, known: tuple[str, ...] = ()) -> np.ndarray:
     """The numbers of a small data set.
 
     Args:
         place: place of the data set.
-        expected: what should be there, for messages.
         known: attributes that the caller applies.
 
     Raises:
         Refused: not numbers, more than `MAX_VALUES`, damage, or an attribute that changes
             values.
     """
-    with opened(place.path, expected) as file:
-        stored = dataset_in(place.path, file, place.name, expected)
+    with opened(place.path) as file:
+        stored = dataset_in(place.path, file, place.name)
         if stored.dtype.kind not in "biuf" or not 0 < math.prod(stored.shape) <= MAX_VALUES:
             got = f"{stored.dtype} {stored.shape}"
             raise Refused(f"{place}: expected up to {MAX_VALUES} numbers, got {got}")
         check_attributes(place.path, stored, known)
-        check_around(place, expected)
+        check_around(place)
         check_chunks(place.path, stored)
         return np.asarray(stored[()])
 
 
-def numbers_at(place: Place, attribute: str, expected: str) -> np.ndarray | None:
+def numbers_at(place: Place, attribute: str) -> np.ndarray | None:
     """An attribute of a data set or group as a row of numbers, as MATLAB writes it [1 n] or [n 1];
     None if it has none.
 
     Raises:
         Refused: other values, or more than `MAX_TEXTS`.
     """
-    with opened(place.path, expected) as file:
+    with opened(place.path) as file:
         attributes: Any = file[place.name].attrs
         if attribute not in attributes:
             return None
@@ -174,18 +171,16 @@ def numbers_at(place: Place, attribute: str, expected: str) -> np.ndarray | None
         return np.ravel(attributes[attribute])
 
 
-def texts_at(places: Sequence[Place], attribute: str, expected: str) -> dict[Place, str]:
+def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
     """A text among the attributes of data sets or groups, or the texts that they are (""), where
     there is one: of several, joined by colons; of another type, its name.
     """
     found: dict[Place, str] = {}
     unread: dict[Path, list[Place]] = {}
     for place in places:
-        with opened(place.path, expected) as file:
+        with opened(place.path) as file:
             stored: Any = (
-                file[place.name]
-                if attribute
-                else dataset_in(place.path, file, place.name, expected)
+                file[place.name] if attribute else dataset_in(place.path, file, place.name)
             )
             if attribute and attribute not in stored.attrs:
                 continue
@@ -231,17 +226,17 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
     """
     stated: list[tuple[str, int, str]] = []
     for attribute in ("DIMENSION_LABELS", "axes", "order"):
-        text = texts_at([place], attribute, expected).get(place, "").strip("[]() ").lower()
+        text = texts_at([place], attribute).get(place, "").strip("[]() ").lower()
         short = len(text) == len(axes) and {*text} <= {*LETTERS}
         names = [*text] if short else re.split(r"[:,\s]+", text)
         if attribute == "order" and text and len(names) != len(axes):
             raise Refused(f"{place}: expected {expected}, got the order {text!r}; remove it")
         if len(names) == len(axes):
             stated += [(name, n, attribute) for n, name in enumerate(names)]
-    with opened(place.path, expected) as file:
+    with opened(place.path) as file:
         indices = [name for name in file[place.name].attrs if name.endswith("_indices")]
     for attribute in indices:
-        found = numbers_at(place, attribute, expected)
+        found = numbers_at(place, attribute)
         if found is not None and len(found) == 1:
             stated.append((attribute.removesuffix("_indices").lower(), int(found[0]), attribute))
     for name, n, attribute in stated:
@@ -270,13 +265,13 @@ def groups(file: h5py.File) -> Iterator[h5py.Group]:
                     waiting.append(group[name])
 
 
-def listing(path: Path, expected: str, most: int = 12) -> str:
+def listing(path: Path, most: int = 12) -> str:
     """What a file contains: its data sets of several values, the largest first, and its links to
     other files.
     """
-    check_file(path, expected)
+    check_file(path, "an HDF5 file")
     sizes: list[tuple[int, str]] = []
-    with opened(path, expected) as file:
+    with opened(path) as file:
         for group in groups(file):
             for name in group:
                 link, where = group.get(name, getlink=True), f"{group.name.rstrip('/')}/{name}"

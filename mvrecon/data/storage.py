@@ -121,7 +121,9 @@ def held() -> Iterator[None]:
 
 
 @contextmanager
-def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterator[h5py.File]:
+def opened(
+    path: Path, expected: str = "an HDF5 file", what: str = "cannot be opened"
+) -> Iterator[h5py.File]:
     """Context of an open HDF5 file, in which any error names it.
 
     Raises:
@@ -137,7 +139,7 @@ def opened(path: Path, expected: str, what: str = "cannot be opened") -> Iterato
         yield files[path]
 
 
-def dataset_in(path: Path, file: h5py.File, name: str, expected: str) -> h5py.Dataset:
+def dataset_in(path: Path, file: h5py.File, name: str, expected: str = "one") -> h5py.Dataset:
     """Return a dataset that is stored in this file and unpacks to no more than it declares.
 
     Raises:

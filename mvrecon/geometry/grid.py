@@ -209,6 +209,14 @@ class Grid:
         z, y, x = (-(-n // k) for n, k in zip(self.shape, joined, strict=True))
         return Grid((z, y, x), affine)
 
+    def divided(self, counts: Sequence[int]) -> "Grid":
+        """The same box in `counts` voxels along (x, y, z)."""
+        ratio = self.affine.new_tensor(self.size) / self.affine.new_tensor(counts)
+        affine = self.affine.clone()
+        affine[:3, :3] *= ratio
+        affine[:3, 3] = self.to_world((ratio - 1) / 2)
+        return Grid((counts[2], counts[1], counts[0]), affine)
+
 
 def _check_shape(shape: Sequence[int], name: str = "shape", order: str = "(z, y, x)") -> None:
     if len(shape) != 3 or min(shape) < 1:
@@ -284,11 +292,7 @@ def coarse(grid: Grid, most: int) -> Grid:
         min(n, math.ceil(mm / step - 1e-6))
         for n, mm in zip(grid.size, lengths.tolist(), strict=True)
     ]
-    ratio = grid.affine.new_tensor(grid.size) / grid.affine.new_tensor(counts)
-    affine = grid.affine.clone()
-    affine[:3, :3] *= ratio
-    affine[:3, 3] = grid.to_world((ratio - 1) / 2)
-    return Grid((counts[2], counts[1], counts[0]), affine)
+    return grid.divided(counts)
 
 
 Three = tuple[int, int, int]

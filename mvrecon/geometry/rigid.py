@@ -81,6 +81,14 @@ def random_in_ball(generator: torch.Generator, radius: float = 1.0) -> Float[Ten
     return direction * radius * torch.rand((), generator=generator, dtype=torch.float64) ** (1 / 3)
 
 
+def rotation_by(vectors: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3 3"]:
+    """Rotations by rotation vectors in radians, smooth at zero."""
+    x, y, z = vectors.unbind(dim=-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack(row, dim=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return torch.linalg.matrix_exp(torch.stack(rows, dim=-2))
+
+
 def inverse(
     R: Float[Tensor, "*n 3 3"], t: Float[Tensor, "*n 3"]
 ) -> tuple[Float[Tensor, "*n 3 3"], Float[Tensor, "*n 3"]]:

@@ -4,7 +4,7 @@ A subclass of `LinearOperator` implements the shapes, A x and A^T y. Its parts (
 `with_support`) default to computing the whole operator.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -231,6 +231,15 @@ class LinearOperator:
     #: Whether each sample of a batch has its own operator.
     per_sample = False
 
+    def for_case(self, case: Mapping[str, Any]) -> Any:
+        """The operator of a batch of cases: another one only of an operator with something of a
+        case's own, such as the attenuation map of a patient.
+
+        Args:
+            case: a batch of the data set, by name.
+        """
+        return self
+
     def of_sample(self, index: int) -> Any:
         """The operator of one sample of a batch."""
         return self
@@ -244,6 +253,21 @@ def sees_integrals(A: LinearOperator) -> bool:
     """Whether an operator's pixels are plain line integrals."""
     pixel = A.pixel_integral()
     return pixel is not None and bool((pixel.weight == 1).all())
+
+
+class Symmetric(LinearOperator):
+    """An operator that is its own adjoint."""
+
+    def __init__(self, shape: Sequence[int], device: torch.device | str):
+        self.domain_shape = self.range_shape = tuple(shape)
+        self._device = torch.device(device)
+
+    @property
+    def device(self) -> torch.device:
+        return self._device
+
+    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
+        return self.forward(y)
 
 
 class Projector(nn.Module, LinearOperator):
@@ -293,48 +317,38 @@ class Transposed(Derived):
         return self.A(y)
 
 
-class Composed(nn.Module, LinearOperator):
-    """The product A B of two operators, x -> A (B x).
+class Composed(nn.Module, Derived):
+    """The product S A of two operators, x -> S (A x).
 
     Raises:
         ValueError: shapes that do not agree.
     """
 
-    B: Any
+    S: Any
 
-    def __init__(self, A: LinearOperator, B: LinearOperator):
+    def __init__(self, S: LinearOperator, A: LinearOperator):
         super().__init__()
-        if A.domain_shape != B.range_shape:
-            shapes = f"{A.domain_shape} and {B.range_shape}"
-            raise ValueError(f"A B needs A's domain to be B's range, got {shapes}")
-        self.A, self.B = A, B
-        self.domain_shape, self.range_shape = B.domain_shape, A.range_shape
-
-    @property
-    def device(self) -> torch.device:
-        return self.B.device
-
-    @property
-    def emission(self) -> bool:
-        return self.B.emission
-
-    @property
-    def grid(self) -> Grid:
-        return self.B.grid
+        if S.domain_shape != A.range_shape:
+            shapes = f"{S.domain_shape} and {A.range_shape}"
+            raise ValueError(
+                f"Expected S's domain to be A's range for the product S A, got {shapes}"
+            )
+        self.S, self.A = S, A
+        self.domain_shape, self.range_shape = A.domain_shape, S.range_shape
 
     @property
     def pose_gradient(self) -> bool:
-        return self.A.pose_gradient or self.B.pose_gradient
+        return self.S.pose_gradient or self.A.pose_gradient
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *m"]:
-        return self.A(self.B(x))
+        return self.S(self.A(x))
 
     def adjoint(self, y: Float[Tensor, "b c *m"]) -> Float[Tensor, "b c *n"]:
-        return self.B.adjoint(self.A.adjoint(y))
+        return self.A.adjoint(self.S.adjoint(y))
 
     def mu_map(self) -> Float[Tensor, "d h w"] | None:
-        """B's."""
-        return self.B.mu_map()
+        """A's."""
+        return self.A.mu_map()
 
 
 class Wrapped(Derived, Projector):

@@ -232,7 +232,7 @@ class RayTransform(FixedGeometry):
 
     def _restrict(self, support: Bool[Tensor, "d h w"] | None) -> None:
         """Set the support."""
-        mask = check_support(support, self.grid)
+        mask = check_support(support, self.grid.shape)
         self.support = None if mask is None else mask.to(self.device)
         self._last: Tensor | None = None
         if mask is not None:
@@ -250,7 +250,7 @@ class RayTransform(FixedGeometry):
         return inside
 
     def _occupancy(self) -> tuple[Tensor, Box]:
-        mask = check_support(self.support, self.grid)
+        mask = check_support(self.support, self.grid.shape)
         occupancy = Occupancy.whole(self.grid.shape)
         if mask is not None and self.skip != "off" and operators.COMPILED:
             voxels, rays = mask[None].to("cpu", torch.uint8), self.fixed_lines.cpu()
@@ -326,7 +326,7 @@ class RayTransform(FixedGeometry):
     def with_support(self, support: Bool[Tensor, "d h w"] | None) -> LinearOperator:
         """The same operator with another support, or with none."""
         if "support" not in self.capabilities:
-            return super().with_support(check_support(support, self.grid))
+            return super().with_support(check_support(support, self.grid.shape))
         other = copy(self)
         other._buffers = dict(self._buffers)
         other._restrict(support)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from mvrecon.geometry.grid import Box, Grid
+from mvrecon.geometry.grid import Box
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.operator import Derived, LinearOperator, check_floating
@@ -276,15 +276,15 @@ def skip_report(code: Tensor | None, skip: str, shape: Sequence[int]) -> Skipped
     return Skipped(mode, occupancy.box, why, fractions)
 
 
-def check_support(support: Tensor | None, grid: Grid) -> Bool[Tensor, "d h w"] | None:
+def check_support(support: Tensor | None, shape: tuple[int, ...]) -> Bool[Tensor, "d h w"] | None:
     """Check the shape and dtype of a support.
 
     Raises:
-        ValueError: not a mask of the grid's shape.
+        ValueError: not a mask of the volume's shape.
     """
-    if support is not None and (support.dtype != torch.bool or support.shape != grid.shape):
+    if support is not None and (support.dtype != torch.bool or support.shape != shape):
         raise ValueError(
-            f"A support is a mask of bool with the grid's shape {grid.shape}, "
+            f"A support is a mask of bool with the volume's shape {shape}, "
             f"got {str(support.dtype).removeprefix('torch.')} of {tuple(support.shape)}"
         )
     return support

@@ -24,7 +24,6 @@ from mvrecon.data import digests
 from mvrecon.data.dataset import Batch, single_cases
 from mvrecon.data.module import SceneData
 from mvrecon.methods.method import Reconstruction
-from mvrecon.operators.cases import operator_for
 from mvrecon.operators.operator import Projector
 from mvrecon.report import metrics
 from mvrecon.report.cameras import camera_row, cameras_of
@@ -81,9 +80,9 @@ def evaluate(
     scores: Scores = {label: [] for label in methods}
     for case in chain.from_iterable(map(single_cases, batches)):
         scene: Any = {k: v.to(device) if isinstance(v, Tensor) else v for k, v in case.items()}
-        volumes, of_case = {}, operator_for(A, scene)
+        volumes, of_case = {}, A.for_case(scene)
         for label, method in ready.items():
-            B = operator_for(others[label], scene) if label in others else of_case
+            B = others[label].for_case(scene) if label in others else of_case
             needed = None
             if not scores[label]:
                 method(scene["views"], B)  # the first call compiles and fills caches

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import PART_ENDING, written_whole
+from mvrecon.core.files.atomic import PART_ENDING, write_text
 from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.dataset import Batch
 from mvrecon.data.nifti import save_nifti
@@ -75,7 +75,7 @@ def save_views(
         name: name of the case and its subfolder, which is returned.
         views: line integrals, or another projector's output.
         unit: unit of the views.
-        attenuated: whether they are counts that the map of `save_mu`, else `projector.mu`,
+        attenuated: whether they are counts that the map of `save_truth`, else `projector.mu`,
             attenuated.
         dose: expected counts per unit of the views; None: they are no counts.
         duration_s: duration of the measurement of counts, in s; None: unknown.
@@ -108,10 +108,14 @@ def save_views(
 
 
 def save_truth(
-    folder: Path, name: str, volume: Float[Tensor, "d h w"], grid: Grid, unit: str
-) -> Path:
-    """Write the true volume of one case as `truth.nii.gz`, in the rig's world in mm; returns the
-    file.
+    case: Path,
+    volume: Float[Tensor, "d h w"],
+    unit: str,
+    grid: Grid,
+    mu: Float[Tensor, "d h w"] | None = None,
+) -> None:
+    """Write the true volume of a case as `truth.nii.gz`, and its linear attenuation in 1/mm, if it
+    has one, as `mu.nii.gz`, for `projector.mu`; both in the rig's world in mm.
 
     1/mm is converted to Hounsfield units, which scenes of files read; with their option `crop:
     none` the volume keeps its position. Other units are unchanged.
@@ -119,51 +123,35 @@ def save_truth(
     Raises:
         ImportError: nibabel is not installed.
     """
-    path = folder / file_name(name) / "truth.nii.gz"
-    save_nifti(path, hounsfield(volume) if unit == "1/mm" else volume, grid)
-    return path
+    save_nifti(case / "truth.nii.gz", hounsfield(volume) if unit == "1/mm" else volume, grid)
+    if mu is not None:
+        save_nifti(case / MU_FILE, mu, grid)
 
 
-def save_mu(folder: Path, name: str, mu: Float[Tensor, "d h w"], grid: Grid) -> Path:
-    """Write the linear attenuation of one case in 1/mm as `mu.nii.gz`, for `projector.mu`; returns
-    the file.
-
-    Raises:
-        ImportError: nibabel is not installed.
-    """
-    path = folder / file_name(name) / MU_FILE
-    save_nifti(path, mu, grid)
-    return path
-
-
-def save_placement(folder: Path, name: str, placement: Float[Tensor, "4 4"]) -> Path:
+def save_placement(case: Path, placement: Float[Tensor, "4 4"]) -> None:
     """Write a case's position as `placement.json`: the affine map in mm from the file's world to
     the rig's, and its last column, the shift.
     """
-    path = folder / file_name(name) / "placement.json"
     record = {"file_to_rig": placement.tolist(), "shift_mm": placement[:3, 3].tolist()}
-    with written_whole(path) as part:
-        part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    return path
+    write_text(case / "placement.json", json.dumps(record, indent=1) + "\n")
 
 
-def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
-    """Write the views of one case as a detector's grey values in `projections`: 16-bit TIFF with
+def save_greys(case: Path, views: Float[Tensor, "m v u"]) -> None:
+    """Write the views of a case as a detector's grey values in `projections`: 16-bit TIFF with
     dark and flat field.
 
     Convention: RTK's; the first row is the lowest one, opposite to `views`. Images of an earlier
     run are replaced one by one, so that each is whole at any time; other files stay.
 
     Args:
-        folder: folder of all cases.
-        name: name of the case.
+        case: folder of the case.
         views: line integrals of attenuation.
 
     Raises:
         ValueError: integrals beyond the range of 16 bits, as of another unit than 1/mm.
     """
     check_greys(views)
-    path = folder / file_name(name) / "projections"
+    path = case / "projections"
     earlier = {image.name for image in path.glob("view_*.tif")}
     part = path.with_name(f".projections.{os.getpid()}{PART_ENDING}") if earlier else path
     write_projections(part, views.flip(-2), Exposure(photons=None))
@@ -174,7 +162,6 @@ def save_greys(folder: Path, name: str, views: Float[Tensor, "m v u"]) -> Path:
         part.rmdir()
         for name in earlier:  # of a rig with more views
             (path / name).unlink()
-    return path
 
 
 def check_greys(views: Float[Tensor, "*m v u"]) -> None:

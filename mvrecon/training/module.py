@@ -18,7 +18,6 @@ from mvrecon.data.dataset import Batch, camera_of, single_cases
 from mvrecon.geometry.cameras.field import common_field
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.method import Reconstruction, build_method
-from mvrecon.operators.cases import operator_for
 from mvrecon.operators.memo import kept
 from mvrecon.operators.operator import Projector
 from mvrecon.report.cameras import TRUE_KEYS, camera_metrics
@@ -214,7 +213,7 @@ class ReconstructionModule(L.LightningModule):
 
     def operator(self, batch: Batch) -> Projector:
         """The operator of a batch's views."""
-        return operator_for(self._rig(batch), batch)
+        return self._rig(batch).for_case(batch)
 
     def on_train_start(self) -> None:
         """Set the learning rate by the schedule: that of the new length for an extended training,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from mvrecon import __version__
-from mvrecon.core.files.atomic import claimed, written_whole
+from mvrecon.core.files.atomic import claimed, write_text
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
 from mvrecon.data import digests
@@ -112,7 +112,7 @@ def keep_measurement(folder: Path, data: "SceneData") -> None:
         compare_measurement(folder, data.digests("train", "test"))
         return
     files.save(data.cameras, folder / RIG)
-    write(folder / DIGESTS_FILE, json.dumps(data.digests("train", "test"), indent=1) + "\n")
+    write_text(folder / DIGESTS_FILE, json.dumps(data.digests("train", "test"), indent=1) + "\n")
 
 
 def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
@@ -154,8 +154,10 @@ def versions() -> dict[str, str]:
 
 def start(folder: Path, settings: Mapping[str, object], file: str = SETTINGS) -> None:
     """Write a run's settings, plain and resolved, and the versions."""
-    write(folder / file, yaml.safe_dump(dict(settings), sort_keys=False))
-    write(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items()))
+    write_text(folder / file, yaml.safe_dump(dict(settings), sort_keys=False))
+    write_text(
+        folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items())
+    )
 
 
 def read_settings(folder: Path) -> TrainSettings:
@@ -183,13 +185,7 @@ def write_results(folder: Path, results: Mapping[str, object]) -> None:
     "inf" or "-inf", which `float` reads.
     """
     whole = {**results, "command": sys.argv, "versions": versions()}
-    write(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
-
-
-def write(path: Path, text: str) -> None:
-    """Write a text file; an existing file is replaced atomically."""
-    with written_whole(path) as part:
-        part.write_text(text, encoding="utf-8")
+    write_text(folder / RESULTS, json.dumps(_finite(whole), indent=2, allow_nan=False) + "\n")
 
 
 def _finite(value: Any) -> Any:

@@ -48,7 +48,7 @@ def targets(sentinel: Path) -> dict[str, dict[str, Any]]:
             "init": {"class_path": "os.system"},
         },
         "a function that writes": {
-            "_target_": "mvrecon.training.run_folder.write",
+            "_target_": "mvrecon.training.run_folder.write_text",
             "path": str(sentinel),
             "text": "x",
         },

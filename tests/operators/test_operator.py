@@ -47,7 +47,7 @@ def test_a_product_is_one_operator_after_the_other(A):
     x, _ = pair(A)
     assert torch.equal(normal(x), A.adjoint(A(x)))
     assert_adjoint(normal)
-    with pytest.raises(ValueError, match="A's domain to be B's range"):
+    with pytest.raises(ValueError, match="S's domain to be A's range"):
         A @ A
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from mvrecon.apps.config import compose
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.parts import METRICS
 from mvrecon.methods.classical.sirt import backprojection
 from mvrecon.methods.method import Reconstruction, Solver
@@ -57,7 +58,7 @@ def test_a_failed_volume_is_counted_and_shown_but_never_averaged(settings, spoil
     (line,) = report.remarks(found)
     assert all(name in line for name in first["failed"])
 
-    run_folder.write(tmp_path / "config.yaml", "{}")
+    write_text(tmp_path / "config.yaml", "{}")
     run_folder.write_results(tmp_path, found)
     assert [row.failed for row in read([tmp_path])] == [2, 0]
 

@@ -10,6 +10,7 @@ import yaml
 
 from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.settings import ReconstructSettings, TrainSettings
+from mvrecon.core.files.atomic import write_text
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import MetricsFile
 
@@ -69,9 +70,9 @@ def test_the_version_of_torch_includes_its_build(monkeypatch):
 
 
 def test_a_failed_write_keeps_the_old_file(tmp_path):
-    run_folder.write(tmp_path / "a.txt", "old")
+    write_text(tmp_path / "a.txt", "old")
     with pytest.raises(UnicodeEncodeError):
-        run_folder.write(tmp_path / "a.txt", "new \udcff")
+        write_text(tmp_path / "a.txt", "new \udcff")
     assert (tmp_path / "a.txt").read_text() == "old"
 
 

@@ -67,11 +67,9 @@ def one_line(app: str) -> Iterator[None]:
     """
     traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
     given: Counter[tuple[str, ...]] = Counter()
-    stops = ["Ctrl-C", 128 + signal.SIGINT]
 
     def terminate(number: int, _: object) -> None:
-        stops[:] = [signal.Signals(number).name, 128 + number]
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(signal.Signals(number))
 
     def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> str:
         text = f"{app}: {category.__name__}: {message}\n"
@@ -85,8 +83,9 @@ def one_line(app: str) -> Iterator[None]:
         with _handled(terminate):
             yield
     except KeyboardInterrupt as stop:
-        sys.stderr.write(f"{app}: stopped by {stops[0]}\n")
-        raise SystemExit(stops[1]) from stop
+        by = stop.args[0] if stop.args else signal.SIGINT
+        sys.stderr.write(f"{app}: stopped by {'Ctrl-C' if by == signal.SIGINT else by.name}\n")
+        raise SystemExit(128 + by) from stop
     except (TaskFailed, *USER_ERRORS) as raised:
         error = raised.error if isinstance(raised, TaskFailed) else raised
         is_fault = isinstance(error, PROGRAM_FAULTS) and not isinstance(

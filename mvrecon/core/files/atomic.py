@@ -53,6 +53,12 @@ def written_whole(path: str | Path, previous: Path | None = None) -> Iterator[Pa
         part.unlink(missing_ok=True)
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8, see `written_whole`."""
+    with written_whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Context in which an OSError that names no file, as of a full disk, names `path`."""

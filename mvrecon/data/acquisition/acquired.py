@@ -18,7 +18,6 @@ from mvrecon.data.dataset import CaseStore
 from mvrecon.data.scenes.sample import Sample, Scene
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.operators.cases import operator_for
 from mvrecon.operators.operator import PixelIntegral, Projector, sees_integrals
 
 #: Random series of detector and rig errors, apart from that of the objects.
@@ -176,7 +175,7 @@ class Acquired(Scene):
         fine, rays = self.acquisition.fine, self.acquisition.rays
         source = source_of({**self.projector, **acting}, grid, rig, fine, exact, rays)
         if isinstance(source, Projection) and not self.scene.map_names:
-            operator_for(source.operator, {})  # raises for cases without required maps
+            source.operator.for_case({})  # raises for cases without required maps
         if not maps and self.acquisition.disturbed is None:
             self._source = (grid, rig, source)
         return source

@@ -17,10 +17,6 @@ from mvrecon.data.linked import Place, beside, check_around, followed, numbers_a
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 
-EXPECTED = (
-    "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
-    "mvrecon-simulate, or views.dataset=<name> of other frames"
-)
 #: Attributes of frames by which areaDetector states their part of the detector.
 REGION = ("NDArrayDimOffset", "NDArrayDimBinning", "NDArrayDimReverse")
 #: `H5S_SEL_ALL` of HDF5: a whole data set.
@@ -48,7 +44,7 @@ class Frames:
 
     def __init__(self, place: Place, folder: Path):
         self.place, self._sound = place, set()
-        with opened(place.path, EXPECTED) as file:
+        with opened(place.path) as file:
             stored: Any = file[place.name]
             if not isinstance(stored, h5py.Dataset):
                 raise Refused(f"{place}: expected a data set of frames, got a group")
@@ -58,7 +54,7 @@ class Frames:
             self.shape = (1,) * (3 - stored.ndim) + stored.shape
             self.dtype = stored.dtype
             check_attributes(place.path, stored, ("units", *REGION))
-            check_around(place, EXPECTED)
+            check_around(place)
             if not stored.is_virtual:
                 self.parts = [Segment(place, 0, self.shape[0])]
             else:
@@ -74,7 +70,7 @@ class Frames:
     def _common(self, name: str) -> np.ndarray | None:
         """An attribute of the data set, and of those of its parts; None if they have none."""
         places = dict.fromkeys([self.place, *(part.place for part in self.parts)])
-        stated = [numbers_at(place, name, EXPECTED) for place in places]
+        stated = [numbers_at(place, name) for place in places]
         known = [numbers for numbers in stated if numbers is not None]
         if other := [numbers for numbers in known if not same(numbers, known[0])]:
             raise Refused(f"{self.place}: expected one {name}, got {known[0]} and {other[0]}")
@@ -85,13 +81,13 @@ class Frames:
         path = self.place.path
         if source.file_name != ".":
             path = beside(path, source.file_name, self.place.name, folder)
-        found, rows = followed(path, source.dset_name, EXPECTED, folder), self.shape[1:]
+        found, rows = followed(path, source.dset_name, folder), self.shape[1:]
         if found is not None:
-            with opened(found.path, EXPECTED) as file:
-                stored = dataset_in(found.path, file, found.name, EXPECTED)
+            with opened(found.path) as file:
+                stored = dataset_in(found.path, file, found.name)
                 check_attributes(found.path, stored, ("units", *REGION))
                 shape = stored.shape
-            check_around(found, EXPECTED)
+            check_around(found)
             start, end = source.vspace.get_select_bounds()
             first, count = 0, end[0] - start[0] + 1
             pixels = [source.vspace.get_select_npoints()]
@@ -116,8 +112,8 @@ class Frames:
             if not len(inside):
                 continue
             wanted = numbers[inside] - begin + part.first
-            with opened(part.place.path, EXPECTED) as file:
-                stored = dataset_in(part.place.path, file, part.place.name, EXPECTED)
+            with opened(part.place.path) as file:
+                stored = dataset_in(part.place.path, file, part.place.name)
                 if stored.dtype.kind not in "iuf" or stored.shape[-2:] != self.shape[1:]:
                     got = f"{stored.dtype} {stored.shape}"
                     raise Refused(f"{part.place}: expected frames {self.shape[1:]}, got {got}")

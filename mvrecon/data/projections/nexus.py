@@ -27,7 +27,7 @@ from mvrecon.data.linked import (
     values_at,
 )
 from mvrecon.data.projections import exposures, nexus_axes, nexus_detector
-from mvrecon.data.projections.frames import EXPECTED, REGION, Frames, FrameViews
+from mvrecon.data.projections.frames import REGION, Frames, FrameViews
 from mvrecon.data.projections.nexus_detector import (
     ALIGNMENT,
     BEAM,
@@ -43,6 +43,10 @@ from mvrecon.data.projections.nexus_detector import (
 from mvrecon.data.projections.stack import Hdf5Views, ProjectionStack
 from mvrecon.data.storage import held, opened
 
+EXPECTED = (
+    "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
+    "mvrecon-simulate, or views.dataset=<name> of other frames"
+)
 FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 #: Names of a data set, or of one in another file.
 IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
@@ -154,7 +158,7 @@ def hdf5_views(
         raise Refused(f"{path}: not an HDF5 file, or cut short; expected {EXPECTED}")
     with held(), file_errors(path, "cannot be read as HDF5"):
         if dataset is angles is image_key is None:
-            place = followed(path, "/views", EXPECTED)
+            place = followed(path, "/views")
             if place is not None:
                 return Hdf5Views(path)
         places = _Layout.of(path, dataset, layout == "sinogram")
@@ -171,9 +175,9 @@ def named(path: Path, name: str | Path) -> Place:
     Raises:
         Refused: there is none.
     """
-    if place := followed(path, str(name), EXPECTED) or in_another(name):
+    if place := followed(path, str(name)) or in_another(name):
         return place
-    other, own = Path(name).expanduser(), listing(path, EXPECTED)
+    other, own = Path(name).expanduser(), listing(path)
     file = f"nor is there a file {other}; the first contains {own}"
     if other.is_file():
         file = f"and {other} is a file: name its data set by {other}:/<name>, or one of {own}"
@@ -191,8 +195,8 @@ def in_another(name: str | Path) -> Place | None:
         return None
     file = Path(inside["path"]).expanduser()
     check_file(file, "an HDF5 file")
-    if (place := followed(file, inside["name"], EXPECTED)) is None:
-        raise Refused(f"{file}: has no {inside['name']}; it contains {listing(file, EXPECTED)}")
+    if (place := followed(file, inside["name"])) is None:
+        raise Refused(f"{file}: has no {inside['name']}; it contains {listing(file)}")
     return place
 
 
@@ -223,11 +227,11 @@ class _Layout(NamedTuple):
         wanted = None if dataset is None else named(path, dataset)
         only = None if wanted is None else address(wanted)
         found, lost, names = {}, [], []
-        with opened(path, EXPECTED) as file:
+        with opened(path) as file:
             keyed = {g.name: "image_key" in g.keys() for g in groups(file) if "data" in g.keys()}  # noqa: SIM118
         for group in sorted(keyed, key=lambda name: -name.count("/")):  # detector first
             try:
-                place = followed(path, f"{group}/data", EXPECTED)
+                place = followed(path, f"{group}/data")
             except MissingFile as error:
                 lost += [error] if keyed[group] else []
                 continue
@@ -236,7 +240,7 @@ class _Layout(NamedTuple):
             names.append((address(place), place, Place(path, group)))
             if keyed[group] and (key := names[-1][0]) not in found and key == (only or key):
                 found[key] = cls._tomo(path, group, place)
-        data = followed(path, "/exchange/data", EXPECTED)
+        data = followed(path, "/exchange/data")
         if data is not None and (key := address(data)) not in found and key == (only or key):
             found[key] = cls._exchange(path, data, sinogram)
         if wanted is not None and not found:
@@ -247,12 +251,12 @@ class _Layout(NamedTuple):
             places = ", ".join(str(layout.frames) for layout in found.values())
             got = f"frames in {places}; choose by views.dataset=<name>"
             if not found:
-                got = f"none; it contains {listing(path, EXPECTED)}"
+                got = f"none; it contains {listing(path)}"
             raise Refused(f"{path}: expected {EXPECTED}, got {got}")
         layout = next(iter(found.values()))._replace(sinogram=sinogram)
         for key, place, group in names:  # NXdata may scale what it links to, or state its axes
             if key in found:
-                check_around(place, EXPECTED)
+                check_around(place)
                 check_order(group, layout.axes, FRAMES)
         return layout
 
@@ -265,33 +269,33 @@ class _Layout(NamedTuple):
             above = ["/".join(["", *parts[:k]]) for k in range(len(parts), -1, -1)]
             for name in names:
                 for start in above:
-                    if (place := followed(path, f"{start}/{name}", EXPECTED)) is not None:
+                    if (place := followed(path, f"{start}/{name}")) is not None:
                         return place
             return None
 
         entry = group.rpartition("/instrument")[0]
         source = first("instrument/source/type", "source/type")
-        kind = None if source is None else texts_at([source], "", EXPECTED).get(source)
+        kind = None if source is None else texts_at([source], "").get(source)
         parallel = kind is None or PARALLEL.search(kind)
         for axis, option in (("x", "columns"), ("y", "rows")):
             flipped = there(path, f"{group}/{axis}_flipped")
-            if flipped is not None and values_at(flipped, EXPECTED).any():
+            if flipped is not None and values_at(flipped).any():
                 warnings.warn(
                     f"{flipped}: the {option} of the frames are mirrored; without "
                     f"views.flip_{option}=true so is the volume",
                     stacklevel=2,
                 )
-        nexus_axes.warn_of_turned(Place(path, group), EXPECTED)
+        nexus_axes.warn_of_turned(Place(path, group))
         shares = [f"{name}/{exposures.ATTENUATOR}" for name in _members(path, entry, "instrument")]
-        key = followed(path, f"{group}/image_key_control", EXPECTED)
+        key = followed(path, f"{group}/image_key_control")
         sizes = [
-            [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size", "")]
+            [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size")]
             for axis in "yx"
         ]
         pairs = [(y, x) for y, x in zip(*sizes, strict=True) if y is not None and x is not None]
         return cls(
             frames,
-            key or followed(path, f"{group}/image_key", EXPECTED),
+            key or followed(path, f"{group}/image_key"),
             first("sample/rotation_angle", "data/rotation_angle", "rotation_angle"),
             (),
             pairs,
@@ -313,14 +317,14 @@ class _Layout(NamedTuple):
     def _exchange(cls, path: Path, frames: Place, sinogram: bool) -> "_Layout":
         """The layout of Data Exchange."""
         order = "y:theta:x" if sinogram else "theta:y:x"
-        axes = texts_at([frames], "axes", EXPECTED).get(frames)
+        axes = texts_at([frames], "axes").get(frames)
         if axes is not None and axes.replace(" ", "") != order:
             raise Refused(
                 f"{frames}: expected the axes {order}, got {shown(axes)}; views.layout=sinogram is "
                 f"for y:theta:x"
             )
         places = {
-            name: followed(path, f"/exchange/{name}", EXPECTED)
+            name: followed(path, f"/exchange/{name}")
             for name in ("data_white", "data_dark", "theta")
         }
         kept = [("flat", places["data_white"]), ("dark", places["data_dark"])]
@@ -343,7 +347,7 @@ class _Layout(NamedTuple):
         keys = self._keys(frames.shape[0])
         lengths = [place for pair in self.pixel for place in pair]
         monitors = [place for _, place in (*self.exposures, *self.flats)]
-        units = texts_at([*lengths, *monitors], "units", EXPECTED)
+        units = texts_at([*lengths, *monitors], "units")
         stated = {n: of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
         fields: dict[str, ProjectionStack] = {
             name: FrameViews(frames, np.flatnonzero(keys == key), stated=stated)
@@ -357,7 +361,7 @@ class _Layout(NamedTuple):
                 n: of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
             }
             fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats)
-        unit = texts_at([self.frames], "units", EXPECTED).get(self.frames, "")
+        unit = texts_at([self.frames], "units").get(self.frames, "")
         if "flat" in fields and LOGARITHMS.search(unit):
             raise Refused(
                 f"{self.frames}: expected units of intensities beside flat fields, got "
@@ -368,7 +372,7 @@ class _Layout(NamedTuple):
         angles = [] if self.angles is None else [self.angles]
         if angles:
             turns = np.zeros(frames.shape[1], int) if self.sinogram else keys
-            rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW, EXPECTED)
+            rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
         self._warn_of_moves(keys, pixel)
@@ -382,7 +386,7 @@ class _Layout(NamedTuple):
             return np.zeros(count, int)
         if self.sinogram:
             raise Refused(f"{self.key}: expected no keys of sinograms, got some")
-        stored = values_at(self.key, EXPECTED)
+        stored = values_at(self.key)
         if (keys := stored.ravel()).shape != (count,) or max(stored.shape, default=1) < count:
             raise Refused(
                 f"{self.key}: expected a key for each of {count} frames, got {stored.shape}"
@@ -396,12 +400,12 @@ class _Layout(NamedTuple):
 
     def _warn_of_moves(self, keys: np.ndarray, pixel: tuple[float, float] | None) -> None:
         """Warn of translations of the sample between views, by more than a part of a pixel."""
-        below = nexus_axes.translations_below(self.angles, EXPECTED) if self.angles else ()
+        below = nexus_axes.translations_below(self.angles) if self.angles else ()
         for place in dict.fromkeys((*self.moves, *below)):
-            moved = values_at(place, EXPECTED, ("units", *nexus_axes.ATTRIBUTES)).ravel()
+            moved = values_at(place, ("units", *nexus_axes.ATTRIBUTES)).ravel()
             views = moved[keys == VIEW] if len(moved) == len(keys) else moved[:0]
             far = np.ptp(views) if len(views) else 0
-            unit = texts_at([place], "units", EXPECTED).get(place)
+            unit = texts_at([place], "units").get(place)
             if far and not (
                 pixel and unit and far * millimetres(place, unit) < MAX_MOVE_PX * min(pixel)
             ):
@@ -416,7 +420,7 @@ class _Layout(NamedTuple):
         for pair in self.pixel:
             sizes = []
             for place in pair:
-                values = np.unique(values_at(place, EXPECTED, ("units",)))
+                values = np.unique(values_at(place, ("units",)))
                 if not (unit := units.get(place)):
                     warnings.warn(f"{place}: has no units, and is not used", stacklevel=2)
                 elif len(values) == 1 and values[0] > 0:
@@ -432,7 +436,7 @@ def _members(path: Path, entry: str, name: str) -> list[str]:
     """The members of a group of an entry, as <group>/<member>; none if it is not there."""
     if (place := there(path, f"{entry}/{name}")) is None:
         return []
-    with opened(place.path, EXPECTED) as file:
+    with opened(place.path) as file:
         group: Any = file[place.name]
         return [f"{name}/{inner}" for inner in group] if isinstance(group, h5py.Group) else []
 
@@ -441,8 +445,8 @@ def _flat_time(path: Path) -> Place | None:
     """The exposure time of Data Exchange's flat fields, where it is not that of the views."""
     above = "/process/acquisition/flat_fields"
     if (differs := there(path, f"{above}/different_flat_exposure")) is not None:
-        text = texts_at([differs], "", EXPECTED)[differs].strip().lower()  # or a type of numbers
+        text = texts_at([differs], "")[differs].strip().lower()  # or a type of numbers
         number = re.match("u?int|bool", text) is not None
-        if text in ("same", "no") or (number and not values_at(differs, EXPECTED).any()):
+        if text in ("same", "no") or (number and not values_at(differs).any()):
             return None
     return there(path, f"{above}/flat_exposure_time")

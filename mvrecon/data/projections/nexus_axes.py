@@ -38,13 +38,12 @@ KEYS = (
 MAX_LEAN, MAX_CHAIN = 2e-3, 16
 
 
-def degrees_of(angles: Place, kept: np.ndarray, expected: str) -> list[float]:
+def degrees_of(angles: Place, kept: np.ndarray) -> list[float]:
     """The angles of the cameras of views in degrees.
 
     Args:
         angles: place of the angles of all frames, or of the views.
         kept: whether a frame is a view.
-        expected: description of a file with such angles, for messages.
 
     Warns:
         UserWarning: angles of a unit that look like another.
@@ -53,7 +52,7 @@ def degrees_of(angles: Place, kept: np.ndarray, expected: str) -> list[float]:
         Refused: another number of angles, angles that are not finite, all equal, of unknown units,
             or that look like radians; see `_sense`.
     """
-    values = values_at(angles, expected, ("units", *ATTRIBUTES))
+    values = values_at(angles, ("units", *ATTRIBUTES))
     if values.size not in (len(kept), kept.sum()) or values.size != max(values.shape):
         raise Refused(
             f"{angles}: expected an angle for each of {len(kept)} frames"
@@ -63,11 +62,11 @@ def degrees_of(angles: Place, kept: np.ndarray, expected: str) -> list[float]:
     degrees = degrees[kept] if len(degrees) == len(kept) else degrees
     if not np.isfinite(degrees).all():
         raise Refused(f"{angles}: expected finite angles of the views, got {shown(degrees)}")
-    unit = texts_at([angles], "units", expected).get(angles)
+    unit = texts_at([angles], "units").get(angles)
     factor = 1.0 if unit is None else DEGREES.get(unit.strip().lower())
     if factor is None:
         raise Refused(f"{angles}: expected units of {', '.join(DEGREES)}, got {shown(unit)}")
-    degrees *= factor * _sense(angles, expected)
+    degrees *= factor * _sense(angles)
     with file_errors(angles.path, f"{angles.name} is no turn", "give views.angles"):
         check_turning(degrees.tolist())
         if unit is None:
@@ -80,23 +79,23 @@ def degrees_of(angles: Place, kept: np.ndarray, expected: str) -> list[float]:
     return degrees.tolist()
 
 
-def _sense(angles: Place, expected: str) -> float:
+def _sense(angles: Place) -> float:
     """The sense in which cameras turn, 1 or -1, by the attributes of a sample's angles; 1 without a
     vector.
 
     Raises:
         Refused: no rotation, about another axis than the vertical one, or one with an offset.
     """
-    kind = texts_at([angles], "transformation_type", expected).get(angles, "rotation")
+    kind = texts_at([angles], "transformation_type").get(angles, "rotation")
     if kind.strip().lower() != "rotation":
         raise Refused(f"{angles}: expected the transformation_type rotation, got {shown(kind)}")
-    offset = numbers_at(angles, "offset", expected)
+    offset = numbers_at(angles, "offset")
     if offset is not None and offset.any():
         raise Refused(
             f"{angles}: expected the offset 0 of the axis, got {shown(offset.tolist())}; remove "
             f"it, and say calibrate=[offset_u]"
         )
-    vector = numbers_at(angles, "vector", expected)
+    vector = numbers_at(angles, "vector")
     if vector is None:
         return 1.0
     lean = math.hypot(*vector[::2]) / max(float(np.linalg.norm(vector)), 1e-300)
@@ -108,11 +107,11 @@ def _sense(angles: Place, expected: str) -> float:
     return float(-np.sign(vector[1]))
 
 
-def translations_below(angles: Place, expected: str) -> Iterator[Place]:
+def translations_below(angles: Place) -> Iterator[Place]:
     """The translations on which the angles of a sample depend, by their chain of `depends_on`.
 
     Args:
-        angles, expected: see `degrees_of`.
+        angles: place of the angles of all frames, or of the views.
 
     Warns:
         UserWarning: the chain leads to nothing in the file.
@@ -122,19 +121,19 @@ def translations_below(angles: Place, expected: str) -> Iterator[Place]:
     """
     place = angles
     for _ in range(MAX_CHAIN):
-        name = texts_at([place], "depends_on", expected).get(place, ".").strip()
+        name = texts_at([place], "depends_on").get(place, ".").strip()
         if name in ("", "."):
             return
         own = place.name.rpartition("/")[0]
-        below = followed(place.path, name if name.startswith("/") else f"{own}/{name}", expected)
+        below = followed(place.path, name if name.startswith("/") else f"{own}/{name}")
         if below is None:
             warnings.warn(f"{place}: depends on {shown(name)}, which is not there", stacklevel=2)
             return
         place = below
-        kind = texts_at([place], "transformation_type", expected).get(place, "translation")
+        kind = texts_at([place], "transformation_type").get(place, "translation")
         if kind.strip().lower() != "rotation":
             yield place
-        elif (turned := values_at(place, expected, ("units", *ATTRIBUTES))).any():
+        elif (turned := values_at(place, ("units", *ATTRIBUTES))).any():
             raise Refused(
                 f"{angles}: expected an axis that no other rotation turns, got {place} of up to "
                 f"{np.abs(turned).max():g}"
@@ -142,18 +141,18 @@ def translations_below(angles: Place, expected: str) -> Iterator[Place]:
     raise Refused(f"{angles}: expected at most {MAX_CHAIN} transformations by depends_on, got more")
 
 
-def warn_of_turned(detector: Place, expected: str) -> None:
+def warn_of_turned(detector: Place) -> None:
     """Warn of a detector that its transformations turn, as those of mirrored frames do."""
-    if (chain := followed(detector.path, f"{detector.name}/transformations", expected)) is None:
+    if (chain := followed(detector.path, f"{detector.name}/transformations")) is None:
         return
-    with opened(chain.path, expected) as file:
+    with opened(chain.path) as file:
         names = list(group) if isinstance(group := file[chain.name], h5py.Group) else []
     for name in names:
-        if (place := followed(chain.path, f"{chain.name}/{name}", expected)) is None:
+        if (place := followed(chain.path, f"{chain.name}/{name}")) is None:
             continue
-        kind = texts_at([place], "transformation_type", expected).get(place, "")
+        kind = texts_at([place], "transformation_type").get(place, "")
         turns = kind.strip().lower() == "rotation" or (not kind and name in ("rx", "ry", "rz"))
-        if turns and values_at(place, expected, ("units", *ATTRIBUTES)).any():
+        if turns and values_at(place, ("units", *ATTRIBUTES)).any():
             warnings.warn(
                 f"{place}: the detector is turned; without views.flip_columns=true or "
                 f"views.flip_rows=true the volume may be mirrored",

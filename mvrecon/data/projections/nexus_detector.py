@@ -14,7 +14,7 @@ from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import MissingFile, Place, followed, texts_at, values_at
 from mvrecon.data.projections import exposures
 from mvrecon.data.projections.exposures import unneeded
-from mvrecon.data.projections.frames import EXPECTED, Frames
+from mvrecon.data.projections.frames import Frames
 from mvrecon.data.storage import check_chunks, dataset_in, opened
 
 #: Frames of views, flat and dark fields by their image_key; others are left out.
@@ -49,7 +49,7 @@ KEYS = (
 def there(path: Path, name: str) -> Place | None:
     """An optional data set; None also if it is in another file, which is missing."""
     try:
-        return followed(path, name, EXPECTED)
+        return followed(path, name)
     except MissingFile:
         return None
 
@@ -92,7 +92,7 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
     Raises:
         Refused: an exposure that is no number, or many texts.
     """
-    text = texts_at([place], "", EXPECTED).get(place, "").strip()  # or the type of numbers
+    text = texts_at([place], "").get(place, "").strip()  # or the type of numbers
     beam, number = exposures.kind_of(name) == "beam", exposures.NUMBER.fullmatch(text)
     if beam and not NUMERIC.fullmatch(text):
         if re.fullmatch(r"object|\|S\d+", text):  # texts of each frame
@@ -101,7 +101,7 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
     if number:
         values, unit = np.array([float(number[1])]), number[2] or unit
     else:
-        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+        values = values_at(place, ("units",)).ravel().astype(float)
     if not beam:
         values = exposures.in_base_units(values, name, unit, place)
     end = f" {unit}".rstrip() if beam else ""
@@ -142,7 +142,7 @@ def limits_of(
 def _number(place: Place) -> float:
     """A number of a detector; 0 of another one, with a warning."""
     with unneeded():
-        values = values_at(place, EXPECTED, ("units",)).ravel().astype(float)
+        values = values_at(place, ("units",)).ravel().astype(float)
         if len(values) != 1 or not np.isfinite(values[0]):
             raise Refused(f"{place}: expected one number, got {shown(values.tolist())}")
         return float(values[0])
@@ -151,8 +151,8 @@ def _number(place: Place) -> float:
 
 def _mask(place: Place, shape: tuple[int, ...]) -> np.ndarray | None:
     """Bad pixels by a detector's mask [v u]; None of another one, with a warning."""
-    with unneeded("; give it as views.bad_pixels"), opened(place.path, EXPECTED) as file:
-        stored = dataset_in(place.path, file, place.name, EXPECTED)
+    with unneeded("; give it as views.bad_pixels"), opened(place.path) as file:
+        stored = dataset_in(place.path, file, place.name)
         if stored.dtype.kind not in "biu" or (*stored.shape[-2:], stored.size) != (
             *shape,
             math.prod(shape),
@@ -175,7 +175,7 @@ def _check_sequence(place: Place, keys: np.ndarray) -> None:
     """
     own, views = np.zeros(0), np.flatnonzero(keys == VIEW)
     with unneeded():
-        numbers = values_at(place, EXPECTED, ("units",)).ravel()
+        numbers = values_at(place, ("units",)).ravel()
         if len(numbers) not in (len(keys), len(views)):
             raise Refused(
                 f"{place}: expected a number of each of {len(keys)} frames or {len(views)} views, "

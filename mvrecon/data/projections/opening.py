@@ -18,7 +18,7 @@ from mvrecon.data.dicom_image import dicom_file, same
 from mvrecon.data.linked import Place, followed, listing, values_at
 from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
-from mvrecon.data.projections.frames import EXPECTED, Frames, FrameViews
+from mvrecon.data.projections.frames import Frames, FrameViews
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
 from mvrecon.data.projections.nexus import IN_FILE, in_another
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
@@ -151,7 +151,7 @@ def exposures(
     if names := exposure_names(stack, path):
         values = relative_exposure(stack, _field(stack, where, "flat", flat, layout), names)
     elif place := _place_in(stack, path) or in_another(path):
-        values = np.ravel(values_at(place, "exposures", ("units",))).astype(float)
+        values = np.ravel(values_at(place, ("units",))).astype(float)
     else:
         try:
             values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES)[1])
@@ -280,9 +280,9 @@ def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:
     """The data set of a name in the scan's HDF5 file; None if there is none, or a file of it."""
     if views.scan is None or Path(name).expanduser().is_file():
         return None
-    if (place := followed(views.scan, str(name), EXPECTED)) is None:
+    if (place := followed(views.scan, str(name))) is None:
         return None
-    with opened(place.path, EXPECTED) as file:
+    with opened(place.path) as file:
         return place if isinstance(file[place.name], Dataset) else None
 
 
@@ -290,5 +290,4 @@ def _absent(views: ProjectionStack, name: str) -> str:
     """The end of a message: that the scan's HDF5 file lacks what is named; else empty."""
     if views.scan is None:
         return ""
-    contained = listing(views.scan, EXPECTED)
-    return f"; {views.scan} has no {name}, it contains {contained}"
+    return f"; {views.scan} has no {name}, it contains {listing(views.scan)}"

@@ -266,11 +266,9 @@ class Cameras:
                 f"Binning by {factor} needs a positive factor that divides the detector, got "
                 f"{self.shape}"
             )
-        shift = (self.u * (columns - 1) + self.v * (rows - 1)) / 2
         shape = (self.shape[0] // rows, self.shape[1] // columns)
-        source = self.source + shift if self.parallel else self.source
-        u, v = self.u * columns, self.v * rows
-        return replace(self, source=source, origin=self.origin + shift, u=u, v=v, shape=shape)
+        moved = self.shifted(self.source.new_tensor([[columns - 1, rows - 1]]) / 2)
+        return replace(moved, u=self.u * columns, v=self.v * rows, shape=shape)
 
     def cropped(self, rows: tuple[int, int], columns: tuple[int, int]) -> "Cameras":
         """Crop detectors to rows and columns `first` to `last - 1`; pixels keep their positions."""

@@ -14,7 +14,7 @@ from torch.nn.functional import adaptive_avg_pool3d
 from mvrecon.core.parts import CAMERAS, CameraPart, Options
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution, sees
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.lattice import centred_affine
 
 #: Most blocks of voxels along an axis, whose centres are tested; fewer, but no fewer than the
@@ -104,12 +104,7 @@ def _block_shape(grid: Grid, views: int) -> tuple[int, int, int]:
 def _seen(cameras: Cameras, grid: Grid) -> Float[Tensor, "d h w"]:
     """The share of the views that see the centre of each block."""
     shape, rig = _block_shape(grid, len(cameras)), cameras.to("cpu")
-    ends = [torch.linspace(-1 + 1 / n, 1 - 1 / n, n, dtype=torch.float64) for n in shape[::-1]]
-    half = torch.tensor(grid.size, dtype=torch.float64) / 2
-    z, y, x = torch.meshgrid(*ends[::-1], indexing="ij")
-    affine = centred_affine(grid)
-    points = (torch.stack([x, y, z], dim=-1) * half) @ affine[:3, :3].T + affine[:3, 3]
-    flat = points.reshape(-1, 3)
+    flat = voxel_centres(grid.divided(shape[::-1])).reshape(-1, 3)
     counts = torch.zeros(len(flat), dtype=torch.float64)
     for view in rig:
         counts += sees(view, flat)[0]

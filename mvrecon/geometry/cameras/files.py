@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import Refused, check_file, json_of, shown
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 
@@ -31,8 +31,7 @@ def save(cameras: Cameras, path: str | Path) -> None:
         "cameras": [],
     }
     text = json.dumps(head, indent=1).replace("[]", "[\n  " + ",\n  ".join(lines) + "\n ]")
-    with written_whole(path) as part:
-        part.write_text(text + "\n", encoding="utf-8")
+    write_text(path, text + "\n")
 
 
 def from_file(path: str | Path | None) -> Cameras:

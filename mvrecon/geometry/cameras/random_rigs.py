@@ -13,7 +13,7 @@ from mvrecon.core.numbers import generator, uniform
 from mvrecon.core.quantities import NonNegativeInt, Pair, PositiveFloat, PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import Detector, arc, circular, dome
-from mvrecon.geometry.rigid import look_at, unit
+from mvrecon.geometry.rigid import look_at, rotation_by, unit
 
 
 class Misalignment(NamedTuple):
@@ -56,7 +56,7 @@ def misaligned(cameras: Cameras, by: Misalignment) -> Cameras:
     rows, columns = cameras.shape
     right, down = unit(cameras.u), unit(cameras.v)
     axes = torch.stack([right, down, unit(torch.linalg.cross(cameras.u, cameras.v))], dim=1)
-    turn = axes.mT @ _rotation(torch.deg2rad(by.tilt_degrees)) @ torch.linalg.inv(axes.mT)
+    turn = axes.mT @ rotation_by(torch.deg2rad(by.tilt_degrees)) @ torch.linalg.inv(axes.mT)
     u, v = ((turn @ step[..., None])[..., 0] for step in (cameras.u, cameras.v))
     shift = by.offset_px[:, :1] * cameras.u + by.offset_px[:, 1:] * cameras.v
     centre = cameras.detector_centre + shift + by.depth_mm * axes[:, 2]
@@ -91,14 +91,6 @@ def perturbed(
     still = torch.zeros(len(cameras), 1, dtype=torch.float64)
     by = Misalignment(offset_px * offset, tilt_degrees * tilt, source_mm * source, still)
     return misaligned(cameras, by)
-
-
-def _rotation(vector: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3 3"]:
-    """Rotations of rotation vectors in radians, smooth at zero."""
-    x, y, z = vector.unbind(dim=-1)
-    zero = torch.zeros_like(x)
-    rows = [torch.stack(row, dim=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    return torch.linalg.matrix_exp(torch.stack(rows, dim=-2))
 
 
 #: Kinds of rig: a full circle, an arc, a dome about +z, random directions.

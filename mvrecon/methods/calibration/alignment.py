@@ -19,11 +19,11 @@ from torch import Tensor
 from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided
 from mvrecon.methods.classical.fdk import filter_rows, ramp_response
 from mvrecon.methods.method import DEFAULT_PRIOR, Alignment, CameraPrior
-from mvrecon.operators.operator import LinearOperator
+from mvrecon.operators.operator import Symmetric
 
 
-class Blur(LinearOperator):
-    """Gaussian blur along the axes of a tensor, symmetric, with zero padding.
+class Blur(Symmetric):
+    """Gaussian blur along the axes of a tensor, with zero padding.
 
     Args:
         shape: shape of a volume (d, h, w), or of views (m, v, u).
@@ -37,16 +37,11 @@ class Blur(LinearOperator):
         sigmas: Sequence[float],
         device: torch.device | str = "cpu",
     ):
-        self.domain_shape = self.range_shape = tuple(shape)
+        super().__init__(shape, device)
         self._bands = [
-            _band(size, sigma, torch.device(device)) if sigma else None
+            _band(size, sigma, self.device) if sigma else None
             for size, sigma in zip(shape, sigmas, strict=True)
         ]
-        self._device = torch.device(device)
-
-    @property
-    def device(self) -> torch.device:
-        return self._device
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
         for axis, band in enumerate(self._bands, start=2):
@@ -54,12 +49,9 @@ class Blur(LinearOperator):
                 x = (x.movedim(axis, -1) @ band.to(x)).movedim(-1, axis)
         return x.contiguous()
 
-    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
-        return self.forward(y)
 
-
-class RootRamp(LinearOperator):
-    """The square root of the windowed ramp filter along the rows of views, symmetric.
+class RootRamp(Symmetric):
+    """The square root of the windowed ramp filter along the rows of views.
 
     Args:
         shape: shape of the views (m, v, u).
@@ -68,19 +60,11 @@ class RootRamp(LinearOperator):
     """
 
     def __init__(self, shape: Sequence[int], cutoff: float, device: torch.device):
-        self.domain_shape = self.range_shape = tuple(shape)
+        super().__init__(shape, device)
         self._response = ramp_response(shape[-1], "hann", cutoff).clamp_min(0).sqrt()
-        self._device = device
-
-    @property
-    def device(self) -> torch.device:
-        return self._device
 
     def forward(self, x: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
         return filter_rows(x, self._response)
-
-    def adjoint(self, y: Float[Tensor, "b c *n"]) -> Float[Tensor, "b c *n"]:
-        return self.forward(y)
 
 
 def blurred(

@@ -176,11 +176,6 @@ def _slice(grid: Grid, orbit: Orbit, sides: Float[Tensor, "3"], size: int) -> Gr
     """One slice of a grid's box across the axis, about the orbit's plane and as thick as the box,
     so that a tilted row is inside it, in so many voxels along its longer side.
     """
-    counts = torch.ceil(sides * (size / sides.max()) - 1e-6).clamp_min(1)
-    affine = grid.affine.clone()
-    affine[:3, :3] *= sides.new_tensor(grid.size) / counts
-    x, y, z = (int(n) for n in counts)
-    box = Grid((z, y, x), affine)
-    shift = grid.centre - box.centre
-    shift = shift + ((orbit.centre - grid.centre) @ orbit.axis) * orbit.axis
-    return box.moved(torch.eye(3), shift)
+    counts = torch.ceil(sides * (size / sides.max()) - 1e-6).clamp_min(1).int().tolist()
+    shift = ((orbit.centre - grid.centre) @ orbit.axis) * orbit.axis
+    return grid.divided(counts).moved(torch.eye(3), shift)

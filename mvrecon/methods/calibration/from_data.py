@@ -34,7 +34,7 @@ from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.methods.calibration.alignment import Blur, RootRamp, blurred, least_deviations
 from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.methods.classical.truncation import cut_sides
-from mvrecon.operators.operator import LinearOperator, Projector, Scaled, check_finite
+from mvrecon.operators.operator import LinearOperator, Projector, Scaled, Symmetric, check_finite
 
 
 class Kind(NamedTuple):
@@ -200,7 +200,7 @@ def derivatives(
     return torch.stack(columns)
 
 
-class Complement(LinearOperator):
+class Complement(Symmetric):
     """Orthogonal projection of views onto the part that no change of the rig's parameters explains.
 
     Args:
@@ -209,17 +209,13 @@ class Complement(LinearOperator):
     """
 
     def __init__(self, columns: Float[Tensor, "k m v u"], unknowns: Unknowns):
+        super().__init__(columns.shape[1:], columns.device)
         self.columns, basis = columns, unknowns.basis
-        self.domain_shape = self.range_shape = tuple(columns.shape[1:])
         flat = columns.flatten(2).double()
         gram = torch.einsum("kmp,lmp->mkl", flat, flat).to(basis)
         normal = torch.einsum("mkn,mkl,mlo->no", basis, gram, basis)
         self._solution = basis @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
         self._basis = basis
-
-    @property
-    def device(self) -> torch.device:
-        return self.columns.device
 
     def change(self, views: Float[Tensor, "1 1 m v u"]) -> Float[Tensor, "m k"]:
         """The least-squares change of the parameters that explains the views."""
@@ -229,9 +225,6 @@ class Complement(LinearOperator):
     def forward(self, x: Float[Tensor, "1 1 m v u"]) -> Float[Tensor, "1 1 m v u"]:
         explained = torch.einsum("kmvu,mk->mvu", self.columns, self.change(x).to(self.columns))
         return x - explained
-
-    def adjoint(self, y: Float[Tensor, "1 1 m v u"]) -> Float[Tensor, "1 1 m v u"]:
-        return self.forward(y)
 
 
 OperatorOf = Callable[[Cameras], Projector]

@@ -247,10 +247,9 @@ def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
     # empty columns before and behind the rig's own, and its outermost rows once more, as the
     # back-projection fades to zero from their centres on, and they reach half a pixel further
     before, behind = scan.columns
-    shift = before * cameras.u + cameras.v
     shape = (cameras.shape[0] + 2, cameras.shape[1] + before + behind)
-    source = cameras.source - shift if cameras.parallel else cameras.source
-    target = replace(cameras, source=source, origin=cameras.origin - shift, shape=shape)
+    first = cameras.source.new_tensor([[-before, -1]])
+    target = replace(cameras.shifted(first), shape=shape)
     window, longer, beyond = (filtering.filter, filtering.cutoff), None, 0
     response = ramp_response(target.shape[1], *window)
     if filtering.extrapolate:

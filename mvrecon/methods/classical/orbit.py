@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
-from mvrecon.geometry.rigid import unit
+from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.geometry.rigid import rotation_by, unit
 
 #: Greatest deviation of sources (relative to the radius) and of directions from the orbit.
 MAX_ORBIT_DEVIATION = 0.05
@@ -75,9 +75,7 @@ class Orbit:
 
     def turned(self, cameras: Cameras, degrees: Float[Tensor, " m"]) -> Cameras:
         """Turn each camera about the axis by its own angle."""
-        x, y, z = self.axis.tolist()
-        about = self.axis.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        R = torch.linalg.matrix_exp(about * degrees.deg2rad().to(about)[:, None, None])
+        R = rotation_by(self.axis * degrees.deg2rad().to(self.axis)[:, None])
 
         def by(vectors: Tensor) -> Tensor:
             return (R @ vectors[..., None])[..., 0]
@@ -213,10 +211,7 @@ def beyond_rows(cameras: Cameras, orbit: Orbit, grid: Grid) -> str | None:
     common. One that all views see whole loses nothing.
     """
     counts = [min(n, MAX_COARSE_VOXELS) for n in grid.size]
-    places = [
-        (torch.arange(k) + 0.5) * (n / k) - 0.5 for n, k in zip(grid.size, counts, strict=True)
-    ]
-    centres = grid.to_world(torch.cartesian_prod(*places).to(grid.affine)).to(cameras.source)
+    centres = voxel_centres(grid.divided(counts)).reshape(-1, 3).to(cameras.source)
     radius, offset = orbit.cylinder(grid)
     across = centres - orbit.centre - offset
     inside = across - (across @ orbit.axis)[:, None] * orbit.axis

@@ -5,6 +5,7 @@ form OS-SART, for any linear operator.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import Literal, NamedTuple, Unpack
 
@@ -117,11 +118,11 @@ def backprojection(
         ValueError: views of another shape, or not finite.
     """
     views = InverseProblem.of(A, views, 1, {}).views
-    return correction(A, views, sirt_weights(A, views.dtype))
+    return correction(A, sirt_weights(A, views.dtype), views)
 
 
 def correction(
-    A: LinearOperator, residual: Float[Tensor, "b c m v u"], weights: SirtWeights
+    A: LinearOperator, weights: SirtWeights, residual: Float[Tensor, "b c m v u"]
 ) -> Float[Tensor, "b c d h w"]:
     """The SIRT step C A^T R r of residual views r, in the unit of the volume."""
     return weights.column * A.T(weights.row * residual)
@@ -129,6 +130,11 @@ def correction(
 
 #: Maps residual views y - A x to a change of the volume, or a volume to a feasible one.
 Map = Callable[[Tensor], Tensor]
+
+
+def feasible(nonnegative: bool) -> Map:
+    """The map to the nearest volume without negative values, or that to the volume itself."""
+    return (lambda volume: volume.clamp_min(0)) if nonnegative else (lambda volume: volume)
 
 
 def proximal_gradient(
@@ -222,15 +228,8 @@ def sirt(
     """
     problem = InverseProblem.of(A, views, iterations, common)
     known = weights or sirt_weights(problem.A, problem.views.dtype)
-
-    def gradient_step(residual: Tensor) -> Tensor:
-        return correction(problem.A, residual, known)
-
-    def proximal(volume: Tensor) -> Tensor:
-        return volume.clamp_min(0) if nonnegative else volume
-
-    kind = "nesterov" if momentum else "none"
-    return solve(problem, proximal_gradient(problem, gradient_step, proximal, kind))
+    gradient_step, kind = partial(correction, problem.A, known), "nesterov" if momentum else "none"
+    return solve(problem, proximal_gradient(problem, gradient_step, feasible(nonnegative), kind))
 
 
 #: Residual of weight 1/2 in standard deviations of a normal distribution, for which the estimate
@@ -286,16 +285,11 @@ def robust_sirt(
     problem = InverseProblem.of(A, views, iterations, common)
     equal = sirt_weights(problem.A, problem.views.dtype)
 
-    def proximal(volume: Tensor) -> Tensor:
-        return volume.clamp_min(0) if nonnegative else volume
-
-    def gradient_step(weights: SirtWeights) -> Map:
-        return lambda residual: correction(problem.A, residual, weights)
-
     def steps() -> Iterator[Step]:
-        part, weights = problem, equal
+        part, weights, proximal = problem, equal, feasible(nonnegative)
         while True:
-            run = proximal_gradient(part, gradient_step(weights), proximal, "nesterov")
+            gradient_step = partial(correction, problem.A, weights)
+            run = proximal_gradient(part, gradient_step, proximal, "nesterov")
             for step in islice(run, every):
                 part = replace(problem, start=step.volume)
                 yield step

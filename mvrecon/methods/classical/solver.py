@@ -15,6 +15,7 @@ from torch import Tensor
 from mvrecon.core.registry import hint
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.operator import LinearOperator, check, check_finite, check_measured
+from mvrecon.operators.selection import check_support
 
 P = ParamSpec("P")
 #: The kind of a method's views: line integrals, counts, or those a network was trained on.
@@ -179,11 +180,7 @@ class InverseProblem:
             )
         support, start = options.get("support"), options.get("start")
         if support is not None:
-            if support.dtype != torch.bool or tuple(support.shape) != tuple(A.domain_shape):
-                got = f"{support.dtype} {tuple(support.shape)}"
-                raise ValueError(
-                    f"Expected a support, a mask of {tuple(A.domain_shape)}, got {got}"
-                )
+            check_support(support, tuple(A.domain_shape))
             A = A.with_support(support)
             support = support.to(A.device)
         kind = "views" if background is None else "counts [b c m v u]"

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from mvrecon.training.run_folder import write
+from mvrecon.core.files.atomic import write_text
 
 Row = dict[str, Any]
 
@@ -81,12 +81,12 @@ class Rows:
     def __init__(self, path: Path, columns: Sequence[str], keys: Sequence[str]):
         self.path, self.columns, self.keys = path, list(columns), list(keys)
         if not path.exists():
-            write(path, _line(self.columns))
+            write_text(path, _line(self.columns))
         check_header(path, self.columns)
         text = path.read_text(encoding="utf-8")
         if not text.endswith("\n"):  # truncated by a crash
             text = text[: text.rfind("\n") + 1]
-            write(path, text)
+            write_text(path, text)
         lines = list(csv.DictReader(io.StringIO(text)))
         self._done = {self._key(line) for line in lines}
         self.rows: list[Row] = [_parsed(line) for line in lines]

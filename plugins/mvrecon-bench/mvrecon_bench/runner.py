@@ -12,7 +12,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from mvrecon.core.files.atomic import claimed
+from mvrecon.core.files.atomic import claimed, write_text
 from mvrecon.core.files.runs import SETTINGS
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import TensorBoard
@@ -51,7 +51,7 @@ def run(bench: Bench, folder: Path, settings: dict[str, Any] | None = None) -> l
         if settings is not None:
             run_folder.start(folder, settings)
         versions = "".join(f"{name} {version}\n" for name, version in machine().items())
-        run_folder.write(folder / run_folder.VERSIONS, versions)
+        write_text(folder / run_folder.VERSIONS, versions)
         board = TensorBoard(str(folder))
         groups = [[job for job in group if job.row not in table] for group in bench.groups()]
         bars = TextColumn("{task.description}"), BarColumn(16), MofNCompleteColumn()
@@ -80,7 +80,7 @@ def report(bench: Bench, rows: Sequence[Row], folder: Path, board: TensorBoard) 
     from PIL import Image
 
     text = markdown_of(bench, rows, bench.summary(rows, folder))
-    run_folder.write(folder / "table.md", text)
+    write_text(folder / "table.md", text)
     board.experiment.add_text("table", text, len(rows))
     for path in sorted(folder.glob("*.png")):
         with Image.open(path) as picture:

@@ -66,8 +66,7 @@ def read(
     with file_errors(path, "is not a table of angles", "expected a CSV with a line of names"):
         table = _table(text_of(path), {"sid_mm": sid_mm, "sdd_mm": sdd_mm})
         common.check_degrees(table["angle_degrees"].tolist(), small_arc, "angle_degrees")
-        for sid, sdd in zip(table["sid_mm"].tolist(), table["sdd_mm"].tolist(), strict=True):
-            common.check_distances(sid, sdd)
+        common.check_distances(table["sid_mm"], table["sdd_mm"])
         return _cameras(table, Detector.of(detector), -1 if clockwise else 1)
 
 
@@ -128,8 +127,7 @@ def write(cameras: Cameras, path: str | Path) -> None:
         ValueError: parallel beams, pinholes, detectors that are not rectangular or differ, a source
             on the axis, SID > SDD.
     """
-    if cameras.parallel or cameras.extent != "segment":
-        raise ValueError("expected X-ray cone beams for a table of angles, got another rig")
+    common.check_cone(cameras, "a table of angles")
     common.square_pixels(cameras, "A table of angles")
     source, forward = cameras.source, unit(torch.linalg.cross(cameras.u, cameras.v))
     flat = source * source.new_tensor([1, 1, 0])
@@ -138,8 +136,7 @@ def write(cameras: Cameras, path: str | Path) -> None:
         (R * (cameras.detector_centre - source)[:, None]).sum(dim=-1).unbind(dim=-1)
     )
     axes = torch.stack([unit(cameras.u), unit(cameras.v), forward], dim=1)
-    for sid, sdd in zip(flat.norm(dim=-1).tolist(), depth.tolist(), strict=True):
-        common.check_distances(sid, sdd)
+    common.check_distances(flat.norm(dim=-1), depth)
     E = R @ axes.mT
     turns = (
         torch.atan2(E[:, 1, 0], E[:, 0, 0]),

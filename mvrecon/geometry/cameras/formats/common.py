@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import Refused, check_file, file_errors, shown, text_of
 from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.core.registry import hint
@@ -228,8 +228,7 @@ def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Ten
 def save_lines(path: str | Path, head: str, rows: Iterable[Iterable[float]], comma: str) -> None:
     """Write rows of numbers under a header line atomically, in full precision."""
     lines = [comma.join(repr(float(value)) for value in row) for row in rows]
-    with written_whole(path) as part:
-        part.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+    write_text(path, "\n".join([head, *lines]) + "\n")
 
 
 def check_degrees(degrees: list[float], insist: bool, what: str) -> None:
@@ -271,18 +270,30 @@ def unmistakable(degrees: Sequence[float]) -> list[float]:
     return [angle + 360 * like_radians for angle in degrees]
 
 
-def check_distances(sid: float, sdd: float) -> None:
-    """Check that the source-axis distance (sid) is positive mm and below the source-detector
-    distance (sdd).
+def check_distances(sids: float | Float[Tensor, " m"], sdds: float | Float[Tensor, " m"]) -> None:
+    """Check that the source-axis distances (sid) of all views are positive mm and below the
+    source-detector distances (sdd).
 
     Raises:
-        ValueError: sid <= 0 or sid > sdd.
+        ValueError: sid <= 0 or sid >= sdd.
     """
-    if not 0 < sid < sdd:
+    sid, sdd = torch.as_tensor(sids).flatten(), torch.as_tensor(sdds).flatten()
+    if (wrong := ~((sid > 0) & (sid < sdd))).any():
+        view = int(wrong.int().argmax())
         raise ValueError(
-            f"expected 0 < SID < SDD in mm (the axis between source and detector), got SID {sid:g} "
-            f"and SDD {sdd:g}"
+            f"expected 0 < SID < SDD in mm (the axis between source and detector), got SID "
+            f"{sid[view]:g} and SDD {sdd[view]:g}"
         )
+
+
+def check_cone(cameras: Cameras, who: str) -> None:
+    """Check that cameras are X-ray cone beams, for a format of nothing else.
+
+    Raises:
+        ValueError: parallel beams, or pinholes.
+    """
+    if cameras.parallel or cameras.extent != "segment":
+        raise ValueError(f"expected X-ray cone beams for {who}, got another rig")
 
 
 def square_pixels(cameras: Cameras, who: str) -> tuple[float, float]:

@@ -72,8 +72,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
         ValueError: parallel beams or pinholes, which `read` does not support, or pixels of several
             widths, from which `read` could not tell the detectors' distances.
     """
-    if cameras.parallel or cameras.extent != "segment":
-        raise ValueError("expected X-ray cone beams for 3x4 matrices, got another rig")
+    common.check_cone(cameras, "3x4 matrices")
     widths = cameras.u.norm(dim=-1)
     if widths.max() > (1 + 1e-6) * widths.min():
         raise ValueError(

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of
 from mvrecon.core.files.keys import Key
 from mvrecon.geometry.cameras.camera import Cameras
@@ -234,9 +234,8 @@ def _cameras(table: Float[Tensor, "m 9"], plate: Detector) -> Cameras:
         )
     if parallel:  # its length is that of a direction
         sid = torch.where(sid == 0, 1.0, sid)
-    for near, far in zip(sid.tolist(), sdd.tolist(), strict=True):
-        if not parallel:
-            common.check_distances(near, far)
+    else:
+        common.check_distances(sid, sdd)
     axes = _axes(table)
     looking = axes * axes.new_tensor([1, -1, -1])[:, None]
     source = torch.stack([x if parallel else source_x, y if parallel else source_y, sid], dim=-1)
@@ -264,9 +263,8 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
     source, centre = (
         (axes * point[:, None]).sum(dim=-1) for point in (rig.source, rig.detector_centre)
     )
+    common.check_distances(source[:, 2], source[:, 2] - centre[:, 2])
     views = list(zip(axes.tolist(), source.tolist(), centre.tolist(), strict=True))
-    for _, start, end in views:
-        common.check_distances(start[2], start[2] - end[2])
     angles = [gantry_angles(view[0]) for view in views]
     gantries = common.unmistakable([math.degrees(angle[0]) for angle in angles])
     lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>"]
@@ -274,14 +272,12 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
     for view, gantry, (_, out, inner) in zip(views, gantries, angles, strict=True):
         degrees = gantry, math.degrees(out), math.degrees(inner)
         lines += ["  <Projection>", *_view(*view, degrees), "  </Projection>"]
-    with written_whole(path) as part:
-        part.write_text("\n".join([*lines, "</RTKThreeDCircularGeometry>\n"]), encoding="utf-8")
+    write_text(path, "\n".join([*lines, "</RTKThreeDCircularGeometry>\n"]))
 
 
 def check(cameras: Cameras) -> None:
     """Raise ValueError for a rig that `write` refuses."""
-    if cameras.parallel or cameras.extent != "segment":
-        raise ValueError("expected X-ray cone beams for RTK's XML, got another rig")
+    common.check_cone(cameras, "RTK's XML")
     common.square_pixels(cameras, "RTK")
 
 

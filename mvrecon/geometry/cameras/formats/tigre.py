@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.files.checks import Refused, file_errors, json_of, shown
 from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.core.registry import hint
@@ -181,8 +181,7 @@ def _cameras(record: dict[str, Any], degrees: bool | None) -> Cameras:
     angles = _radians("angles", angles, apart, TURN, degrees)
     views, parallel = len(angles), str(record.get("mode")).strip().lower() == "parallel"
     DSD, DSO, COR = (_per_view(record, name, views) for name in ("DSD", "DSO", "COR"))
-    for near, far in zip(DSO.flatten().tolist(), DSD.flatten().tolist(), strict=True):
-        common.check_distances(near, far)
+    common.check_distances(DSO, DSD)
     R = euler_rotation(torch.rad2deg(angles), "zyz")
     turned = _per_view(record, "rotDetector", views)
     aslant = (turned + math.pi / 4) % (math.pi / 2) - math.pi / 4
@@ -215,8 +214,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
         ValueError: parallel beams, pinholes, detectors that are not rectangular or differ, DSO >
             DSD.
     """
-    if cameras.parallel or cameras.extent != "segment":
-        raise ValueError("expected X-ray cone beams for TIGRE, got another rig")
+    common.check_cone(cameras, "TIGRE")
     dDetector = common.square_pixels(cameras, "TIGRE")
     rig = common.into_world(cameras, world)
     u, up = unit(rig.u), -unit(rig.v)
@@ -226,8 +224,7 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
     )
     aside = source * source.new_tensor([0, 1, 1])
     across = centre - aside
-    for near, far in zip(source[:, 0].tolist(), (source - centre)[:, 0].tolist(), strict=True):
-        common.check_distances(near, far)
+    common.check_distances(source[:, 0], (source - centre)[:, 0])
     record = {
         "mode": "cone",
         "DSO": source[:, 0].tolist(),
@@ -238,5 +235,4 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
         "offOrigin": (-(R @ aside[..., None])[..., 0]).flip(-1).tolist(),
         "angles": torch.deg2rad(euler_degrees(R)).tolist(),
     }
-    with written_whole(path) as part:
-        part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(record, indent=1) + "\n")

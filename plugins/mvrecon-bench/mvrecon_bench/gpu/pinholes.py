@@ -11,7 +11,6 @@ from lightning.fabric.utilities import move_data_to_device
 
 from mvrecon.apps.config import compose
 from mvrecon.data.dataset import Batch
-from mvrecon.operators.cases import operator_for
 from mvrecon.training.fit import build_data, build_module
 from mvrecon.training.module import build_projector
 from mvrecon.training.settings import TrainSettings
@@ -40,8 +39,8 @@ def agreement(
     """
     one = {k: v[:1] for k, v in batch.items() if torch.is_tensor(v)}
     place = settings.grid, settings.camera, {"name": "spect", **options}
-    C, there = operator_for(build_projector(*place), one), move_data_to_device(one, device)
-    A = operator_for(build_projector(*place).to(device), there)
+    C, there = build_projector(*place).for_case(one), move_data_to_device(one, device)
+    A = build_projector(*place).to(device).for_case(there)
     x, y = there["volume"], there["views"]
     return {
         "forward": apart(A(x), C(one["volume"])),

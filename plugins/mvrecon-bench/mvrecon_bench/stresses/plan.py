@@ -7,11 +7,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from mvrecon.core.files.atomic import write_text
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.registry import hint
 from mvrecon.core.signatures import required
 from mvrecon.operators.ray_transform import RAY_METHODS
-from mvrecon.training import run_folder
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.rows import Bench, Job, Row, figure, markdown
 from mvrecon_bench.stresses.case import KINDS, Case
@@ -144,7 +144,7 @@ class Stress(Bench):
 
     def summary(self, rows: Sequence[Row], folder: Path) -> str:
         """Write all rows as JSON; the verdicts on each part, and the failures."""
-        run_folder.write(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
+        write_text(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
         groups: dict[tuple[str, ...], list[Row]] = {}
         for row in rows:
             groups.setdefault(tuple(row[name] for name in self.sections), []).append(row)

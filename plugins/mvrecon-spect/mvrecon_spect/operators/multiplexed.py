@@ -63,4 +63,4 @@ class Multiplexed(Composed):
         if not isinstance(selection, ViewSelection):
             return super().subset(selection)
         views = [view * self.holes + hole for view in selection.views for hole in range(self.holes)]
-        return Multiplexed(self.B.subset(ViewSelection(self.B.range_shape, views)), self.holes)
+        return Multiplexed(self.A.subset(ViewSelection(self.A.range_shape, views)), self.holes)

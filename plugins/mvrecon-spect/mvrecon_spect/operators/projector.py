@@ -114,7 +114,7 @@ class Spect(Scaled):
         hole = Hole(diameter_mm, **edge)
         hole.check_way(cameras)
         found = response_of(response, hole, cameras, grid, blur, intrinsic_mm)
-        support = check_support(options.get("support"), grid)
+        support = check_support(options.get("support"), grid.shape)
         attenuation, weight = CaseAttenuation.of(mu), None
         if (method := options.pop("method", FOOTPRINTS)) == FOOTPRINTS:
             check_options(f"The method '{FOOTPRINTS}'", options, ("backend", "support"))
