@@ -85,7 +85,7 @@ def ball_means(
     radii = torch.full((1, 3), diameter / 2, dtype=torch.float64)
     half = diameter / 2 * torch.linalg.inv(grid.affine[:3, :3]).norm(dim=1)
     for centre in centres.double():
-        ball = Solids("ellipsoid", centre[None], torch.eye(3)[None], radii, torch.ones(1))
+        ball = Solids.upright("ellipsoid", centre[None], radii, torch.ones(1))
         share = voxelise(Phantom((ball,)), grid).double()
         apart = (grid.to_index(centre) - grid.centre_index).abs()
         if not (apart + half <= torch.tensor(grid.size) / 2).all():
