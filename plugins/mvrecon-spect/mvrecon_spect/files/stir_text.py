@@ -119,16 +119,16 @@ def write_detector(path: str | Path, text: DetectorText) -> None:
     lines = [
         "Detector of a pinhole system, as STIR reads it",
         f"Number of rings: {len(text.rings)}",
-        f"Sigma (cm): {float(text.sigma_mm / CM)!r}",
-        f"Crystal thickness (cm): {float(text.crystal_mm / CM)!r}",
-        f"Crystal attenuation coefficient (cm -1): {float(text.crystal_mu * CM)!r}",
+        f"Sigma (cm): {_word(text.sigma_mm / CM)}",
+        f"Crystal thickness (cm): {_word(text.crystal_mm / CM)}",
+        f"Crystal attenuation coefficient (cm -1): {_word(text.crystal_mu * CM)}",
     ]
     for ring in text.rings:
         lines += [
             f"Nangles: {ring.count}",
-            f"ang0 (deg): {float(ring.first_degrees)!r}",
-            f"incr (deg): {float(ring.step_degrees)!r}",
-            f"z0 (cm): {float(ring.z_mm / CM)!r}",
+            f"ang0 (deg): {_word(ring.first_degrees)}",
+            f"incr (deg): {_word(ring.step_degrees)}",
+            f"z0 (cm): {_word(ring.z_mm / CM)}",
         ]
     with written_whole(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -165,8 +165,8 @@ def write_collimator(path: str | Path, text: CollimatorText) -> None:
     lines = [
         "Collimator of a pinhole system, as STIR reads it",
         f"Model (cyl/pol): {text.model}",
-        f"Collimator radius (cm): {float(text.radius_mm / CM)!r}",
-        f"Wall thickness (cm): {float(text.wall_mm / CM)!r}",
+        f"Collimator radius (cm): {_word(text.radius_mm / CM)}",
+        f"Wall thickness (cm): {_word(text.wall_mm / CM)}",
         f"Number of holes: {len(text.openings)}",
         f"nh / ind / {place} / y(cm) / z(cm) / shape / sizex(cm) / sizez(cm) / angx(deg) / "
         "angz(deg) / accx(deg) / accz(deg)",
