@@ -91,13 +91,8 @@ class CicekUNet3d(nn.Module):
         if self.padding == "valid":
             for size in x.shape[2:]:
                 valid_size(size, len(self.down))
-        skips: list[Tensor] = []
-        for level, block in enumerate(self.down):
-            if level:
-                skips.append(x)
-                x = pooled(x)
-            x = block(x)
-        for level in reversed(range(len(self.up))):
+        *skips, x = descended(self.down, x)
+        for level in reversed(range(len(skips))):
             x = self.expand[level](x)
             if self.padding == "same":
                 x = trimmed(x, skips[level].shape[2:])
@@ -145,13 +140,8 @@ class ResidualUNet3d(nn.Module):
         self.last = nn.Conv3d(width, outputs, 1)
 
     def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o d h w"]:
-        skips: list[Tensor] = []
-        for level, block in enumerate(self.down):
-            if level:
-                skips.append(x)
-                x = pooled(x)
-            x = block(x)
-        for level in reversed(range(len(self.up))):
+        *skips, x = descended(self.down, x)
+        for level in reversed(range(len(skips))):
             size = list(skips[level].shape[2:])
             x = self.up[level](self.expand[level](x, output_size=size) + skips[level])
         return self.last(x)
@@ -197,9 +187,14 @@ def check_options(width: int, levels: int, norm: str) -> None:
     check_choice("norm", norm, get_args(Norm))
 
 
-def pooled(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
-    """Max-pooling over 2x2x2 voxels, with smaller windows at odd ends."""
-    return F.max_pool3d(x, 2, ceil_mode=True)
+def descended(blocks: nn.ModuleList, x: Float[Tensor, "n c d h w"]) -> list[Tensor]:
+    """The outputs of the blocks of each level, the finest first, with max-pooling over 2x2x2 voxels
+    between levels and smaller windows at odd ends.
+    """
+    outputs: list[Tensor] = []
+    for block in blocks:
+        outputs.append(block(F.max_pool3d(outputs[-1], 2, ceil_mode=True) if outputs else x))
+    return outputs
 
 
 def middle(x: Float[Tensor, "n c d h w"], size: torch.Size) -> Float[Tensor, "n c e i x"]:
