@@ -7,7 +7,7 @@ import torch
 
 from mvrecon.core.parts import REGISTRIES
 from mvrecon_bench.stresses import plan
-from mvrecon_bench.stresses.subject import subject_of
+from mvrecon_bench.stresses.subjects import subject_of
 from mvrecon_bench.stresses.verdict import FAIL, judge
 from tests.covering import takes_long
 
