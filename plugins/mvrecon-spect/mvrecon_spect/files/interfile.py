@@ -76,12 +76,8 @@ class Header:
         Raises:
             Refused: not a number, or the key is missing and there is no default.
         """
-        try:
-            return number(self.text(key, None if default is None else repr(default)), repr(key))
-        except ValueError as error:
-            raise (
-                error if isinstance(error, Refused) else Refused(f"{self.path}: {error}")
-            ) from None
+        text = self.text(key, None if default is None else repr(default))
+        return number_in(self.path, text, repr(key))
 
     def positive(self, key: str, default: float | None = None) -> float:
         """The value of a key as a positive number.
@@ -103,6 +99,18 @@ class Header:
         if value != int(value) or not 0 <= value < 2**40:
             raise Refused(f"{self.path}: expected a whole number for {key!r}, got {value:g}")
         return int(value)
+
+
+def number_in(path: Path, text: str, what: str) -> float:
+    """A finite number in a file's text.
+
+    Raises:
+        Refused: not a number.
+    """
+    try:
+        return number(text, what)
+    except ValueError as error:
+        raise Refused(f"{path}: {error}") from None
 
 
 def read_header(path: str | Path, content: Content) -> Header:

@@ -13,7 +13,8 @@ from typing import Literal, NamedTuple
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
-from mvrecon.geometry.cameras.formats.common import VIEWS, number
+from mvrecon.geometry.cameras.formats.common import VIEWS
+from mvrecon_spect.files.interfile import number_in
 
 #: mm per cm.
 CM = 10.0
@@ -216,10 +217,10 @@ class _Fields:
         return first
 
     def number(self, name: str, unit: str) -> float:
-        return _number(self.path, self.text(name, unit), name)
+        return number_in(self.path, self.text(name, unit), name)
 
     def whole(self, name: str) -> int:
-        value = _number(self.path, self.text(name), name)
+        value = number_in(self.path, self.text(name), name)
         if value != int(value) or not 1 <= value <= VIEWS:
             raise Refused(f"{self.path}: expected 1 to {VIEWS} for {name!r}, got {value:g}")
         return int(value)
@@ -239,8 +240,8 @@ def _opening(path: Path, line: str, model: str) -> Opening:
             f"{path}: expected {WIDTH} values of a hole (detector, place, round or rect, sizes, "
             f"angles), got {shown(line.strip())}"
         )
-    detector, *place = (_number(path, word, "a hole") for word in words[:4])
-    *size, tilt_x, tilt_z, accept_x, accept_z = (_number(path, w, "a hole") for w in words[5:])
+    detector, *place = (number_in(path, word, "a hole") for word in words[:4])
+    *size, tilt_x, tilt_z, accept_x, accept_z = (number_in(path, w, "a hole") for w in words[5:])
     if detector != int(detector) or not 1 <= detector <= VIEWS or min(size) <= 0:
         raise Refused(
             f"{path}: expected a detector from 1 on and positive sizes, got {shown(line.strip())}"
@@ -254,10 +255,3 @@ def _opening(path: Path, line: str, model: str) -> Opening:
         axis_degrees=(tilt_x, tilt_z),
         acceptance_degrees=(accept_x, accept_z),
     )
-
-
-def _number(path: Path, word: str, what: str) -> float:
-    try:
-        return number(word, what)
-    except ValueError as error:
-        raise Refused(f"{path}: {error}") from error
