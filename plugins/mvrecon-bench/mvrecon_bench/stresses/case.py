@@ -72,13 +72,16 @@ def case(
 ) -> Callable[[Measure], Measure]:
     """Make a function a case, whose docstring is `name: property`; see `Case` for the arguments.
 
-    The function returns the measured number, or yields several, of which the greatest counts.
+    The function returns the measured number, or yields several: errors, of which the greatest
+    counts, or with a tolerance of zero numbers of violations, which add up.
     """
 
     def described(function: Measure) -> Measure:
         def measure(subject: Any) -> float:
             found = function(subject)
-            return greatest(found) if isinstance(found, Iterator) else found
+            if not isinstance(found, Iterator):
+                return found
+            return float(sum(found)) if tolerance == 0 else greatest(found)
 
         name, _, holds = " ".join(str(function.__doc__).split()).rstrip(".").partition(": ")
         row = Case(number, name, holds, kind, measure, tolerance, dtypes)

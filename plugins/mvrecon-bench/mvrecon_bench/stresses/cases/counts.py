@@ -62,16 +62,15 @@ def thick_matter(subject: ProjectorSubject) -> Iterator[float]:
 
 
 @case("mvrecon", 50)
-def dense_rays(subject: Subject) -> float:
+def dense_rays(subject: Subject) -> Iterator[float]:
     """Noise behind dense matter: no dense ray becomes empty, up to p = 200."""
-    p, violations = torch.linspace(0, 200, 401, dtype=torch.float64), 0
+    p = torch.linspace(0, 200, 401, dtype=torch.float64)
     for photons in (1e2, 1e4, 1e6):
         for sigmas in (3.0, 4.0, 6.0):
             threshold = noise_threshold(p.to(subject.dtype), photons, sigmas).double()
             dense = p > threshold
             empty = ~dense[int(dense.int().argmax()) :]
-            violations += int((~threshold.isfinite()).sum() + empty.sum())
-    return float(violations)
+            yield int((~threshold.isfinite()).sum() + empty.sum())
 
 
 @case("projector", 51)
