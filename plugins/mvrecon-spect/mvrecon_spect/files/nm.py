@@ -295,7 +295,7 @@ def frame_numbers(image: DicomImage, name: str) -> list[int]:
 
 
 def _check_numbered(image: DicomImage) -> None:
-    """Raise if a vector is missing that says which of several unequal items a frame belongs to."""
+    """Raise if the items of a sequence differ and no vector assigns the frames to them."""
     for vector, name in DESCRIBED.items():
         items = image.value(name) or []
         if image.value(vector) is None and any(item != items[0] for item in items):
@@ -333,8 +333,8 @@ def _window(dataset: Any, index: int) -> EnergyWindow:
 
 
 def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
-    """Raise if several detectors would get the same angles because only rotations state a start
-    angle, or each of several.
+    """Raise if the file does not say where each of several detectors starts: the rotation alone
+    states an angle, or each of several rotations states its own.
     """
     turns = {view[1] for view in views}
     starts = {n: _start(dataset, "RotationInformationSequence", n) for n in sorted(turns)}
@@ -389,8 +389,8 @@ def _check_rotations(path: Path, dataset: Any, views: Sequence[tuple[int, int, i
 
 
 def _alike(name: str, one: Any, other: Any) -> bool:
-    """Whether two start angles are one, or two durations, or two lists of radii, or a radius one of
-    a list.
+    """Whether two start angles, durations or lists of radii are equal, or a list contains a
+    radius.
     """
     if name == DURATION:
         return same(float(one), float(other))

@@ -70,7 +70,7 @@ UNKNOWN = (
 class NmVolume(NamedTuple):
     """A volume of a DICOM NM file, its grid in world mm (RAS) and its unit in UCUM; start of the
     acquisition, duration of each view in s and administered activity in MBq, each None if the file
-    does not contain it, or several.
+    contains none or several.
     """
 
     volume: Float[Tensor, "d h w"]

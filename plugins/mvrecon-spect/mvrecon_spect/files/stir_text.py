@@ -18,7 +18,7 @@ from mvrecon_spect.files.interfile import number_in
 
 #: mm per cm.
 CM = 10.0
-#: Units beside a name or a value, and those of lengths (and attenuation) and angles.
+#: Units that may follow a name or a value, and the units of lengths (and attenuation) and angles.
 UNIT = re.compile(
     r"(?<![a-z])(nm|[uµμ]?m|[mc]m|g|inch(?:es)?|deg(?:rees?)?|rad(?:ians?)?|°)(?![a-z])"
 )
