@@ -30,7 +30,6 @@ from mvrecon.testing.measures import inner_product_gap
 from mvrecon.training.run_folder import versions
 from mvrecon_bench.gpu.measuring import Results, on_device, options_of
 from mvrecon_bench.measure import throughput
-from mvrecon_bench.runner import version_of
 from mvrecon_bench.stresses.fresh_process import python
 from mvrecon_spect.operators import footprints
 from mvrecon_spect.operators.projector import Spect
@@ -290,7 +289,7 @@ def main() -> None:
     options = options_of(__doc__, n=48, modes=[*FIRST_CALLS])
     device, n = on_device(options.device), options.n
     results = Results(options.out, "check")
-    results.add("versions", versions() | {"triton": version_of("triton")})
+    results.add("versions", versions("triton"))
     if device == "cuda":
         results.attempt("machine", machine)
         self_checks(results)
