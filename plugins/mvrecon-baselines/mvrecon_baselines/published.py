@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from mvrecon.core.registry import check_choice
 from mvrecon.methods.learned.unet import trimmed
+from mvrecon_baselines.unet2d import check_sizes
 
 Norm = Literal["batch", "group", "none"]
 Padding = Literal["valid", "same"]
@@ -57,7 +58,8 @@ class CicekUNet3d(nn.Module):
         padding: Padding = "valid",
     ):
         super().__init__()
-        check_options(width, levels, norm)
+        check_sizes(width, levels)
+        check_choice("norm", norm, get_args(Norm))
         check_choice("padding", padding, get_args(Padding))
         self.padding: Padding = padding
         first = [inputs, *(width * 2**level for level in range(1, levels))]
@@ -127,7 +129,8 @@ class ResidualUNet3d(nn.Module):
         self, inputs: int, outputs: int, width: int = 64, levels: int = 5, norm: Norm = "group"
     ):
         super().__init__()
-        check_options(width, levels, norm)
+        check_sizes(width, levels)
+        check_choice("norm", norm, get_args(Norm))
         widths = [width * 2**level for level in range(levels)]
         self.down = nn.ModuleList(
             ResidualBlock(a, b, norm) for a, b in zip([inputs, *widths], widths, strict=False)
@@ -172,19 +175,6 @@ def normalisation(norm: Norm, channels: int) -> nn.Module:
     if norm == "batch":
         return nn.BatchNorm3d(channels)
     return nn.GroupNorm(gcd(GROUPS, channels), channels) if norm == "group" else nn.Identity()
-
-
-def check_options(width: int, levels: int, norm: str) -> None:
-    """Check the options of a U-Net.
-
-    Raises:
-        ValueError: no channels or levels, or an unknown normalisation.
-    """
-    if min(width, levels) < 1:
-        raise ValueError(
-            f"A U-Net needs at least one channel and one level, got width={width}, levels={levels}"
-        )
-    check_choice("norm", norm, get_args(Norm))
 
 
 def descended(blocks: nn.ModuleList, x: Float[Tensor, "n c d h w"]) -> list[Tensor]:
