@@ -131,8 +131,8 @@ def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
     digests.compare(got, expected, f"{path} (its rig is kept as {RIG})")
 
 
-def versions() -> dict[str, str]:
-    """Versions of Python, of mvrecon and of its numerical dependencies.
+def versions(*others: str) -> dict[str, str]:
+    """Versions of Python, of mvrecon, of its numerical dependencies and of other distributions.
 
     Torch's own version includes the build (2.13.0+cu130), which the package index omits.
     """
@@ -144,7 +144,7 @@ def versions() -> dict[str, str]:
         "platform": platform.platform(),
     }
     packages["torch"] = str(torch.__version__)
-    for name in PACKAGES:
+    for name in (*PACKAGES, *others):
         try:
             packages[name] = metadata.version(name)
         except metadata.PackageNotFoundError:

@@ -20,6 +20,7 @@ from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, sentence
 from mvrecon.apps.settings import RECORDS, TrainSettings
 from mvrecon.core.options import check
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
+from mvrecon.core.registry import from_options
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.cameras.coverage import fitted
 from mvrecon.geometry.grid import Grid
@@ -47,7 +48,7 @@ def build_events(settings: dict[str, Any], folder: Path) -> None:
     from mvrecon_spect.events.making import EventSettings
 
     build(settings, folder)
-    EventSettings.of(settings["events"])
+    from_options(EventSettings, "events", settings["events"])
 
 
 def build_training(settings: dict[str, Any], folder: Path) -> None:

@@ -69,6 +69,11 @@ def test_the_version_of_torch_includes_its_build(monkeypatch):
     assert run_folder.versions()["torch"] == "2.13.0+cu130"
 
 
+def test_versions_of_other_distributions_are_listed_after_those_of_mvrecon():
+    own, found = run_folder.versions(), run_folder.versions("pytest", "no-such-thing")
+    assert found == own | {"pytest": pytest.__version__, "no-such-thing": "not installed"}
+
+
 def test_a_failed_write_keeps_the_old_file(tmp_path):
     write_text(tmp_path / "a.txt", "old")
     with pytest.raises(UnicodeEncodeError):

@@ -103,8 +103,7 @@ def derenzo(
         values = torch.cat([values.new_tensor([value * background]), values])
     centres = torch.nn.functional.pad(places, (0, 1))
     semi_axes = torch.stack([radii, radii, torch.full_like(radii, height / 2)], dim=-1)
-    axes = torch.eye(3).expand(len(values), 3, 3)
-    upright = Phantom((Solids("cylinder", centres, axes, semi_axes, values),))
+    upright = Phantom((Solids.upright("cylinder", centres, semi_axes, values),))
     return upright.moved(
         euler_rotation(euler_degrees), torch.tensor(list(centre), dtype=torch.float64)
     )

@@ -79,6 +79,19 @@ class Solids:
                 f"Solids need rotations with orthonormal columns, got {self.rotations.tolist()}"
             )
 
+    @classmethod
+    def upright(
+        cls,
+        kind: str,
+        centres: Float[Tensor, "n 3"],
+        semi_axes: Float[Tensor, "n 3"],
+        values: Float[Tensor, " n"],
+        cuts: Float[Tensor, "n k 4"] | None = None,
+    ) -> "Solids":
+        """Solids whose axes are the world's."""
+        rotations = torch.eye(3).expand(len(values), 3, 3)
+        return cls(kind, centres, rotations, semi_axes, values, cuts)
+
     @property
     def round_axes(self) -> int:
         """The number of round axes: 3 for an ellipsoid, 2 for a cylinder, 0 for a box."""

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from mvrecon.core.registry import check_choice
 from mvrecon.methods.learned.unet import trimmed
+from mvrecon_baselines.unet2d import check_sizes
 
 Norm = Literal["batch", "group", "none"]
 Padding = Literal["valid", "same"]
@@ -57,7 +58,8 @@ class CicekUNet3d(nn.Module):
         padding: Padding = "valid",
     ):
         super().__init__()
-        check_options(width, levels, norm)
+        check_sizes(width, levels)
+        check_choice("norm", norm, get_args(Norm))
         check_choice("padding", padding, get_args(Padding))
         self.padding: Padding = padding
         first = [inputs, *(width * 2**level for level in range(1, levels))]
@@ -91,13 +93,8 @@ class CicekUNet3d(nn.Module):
         if self.padding == "valid":
             for size in x.shape[2:]:
                 valid_size(size, len(self.down))
-        skips: list[Tensor] = []
-        for level, block in enumerate(self.down):
-            if level:
-                skips.append(x)
-                x = pooled(x)
-            x = block(x)
-        for level in reversed(range(len(self.up))):
+        *skips, x = descended(self.down, x)
+        for level in reversed(range(len(skips))):
             x = self.expand[level](x)
             if self.padding == "same":
                 x = trimmed(x, skips[level].shape[2:])
@@ -132,7 +129,8 @@ class ResidualUNet3d(nn.Module):
         self, inputs: int, outputs: int, width: int = 64, levels: int = 5, norm: Norm = "group"
     ):
         super().__init__()
-        check_options(width, levels, norm)
+        check_sizes(width, levels)
+        check_choice("norm", norm, get_args(Norm))
         widths = [width * 2**level for level in range(levels)]
         self.down = nn.ModuleList(
             ResidualBlock(a, b, norm) for a, b in zip([inputs, *widths], widths, strict=False)
@@ -145,13 +143,8 @@ class ResidualUNet3d(nn.Module):
         self.last = nn.Conv3d(width, outputs, 1)
 
     def forward(self, x: Float[Tensor, "n i d h w"]) -> Float[Tensor, "n o d h w"]:
-        skips: list[Tensor] = []
-        for level, block in enumerate(self.down):
-            if level:
-                skips.append(x)
-                x = pooled(x)
-            x = block(x)
-        for level in reversed(range(len(self.up))):
+        *skips, x = descended(self.down, x)
+        for level in reversed(range(len(skips))):
             size = list(skips[level].shape[2:])
             x = self.up[level](self.expand[level](x, output_size=size) + skips[level])
         return self.last(x)
@@ -184,22 +177,14 @@ def normalisation(norm: Norm, channels: int) -> nn.Module:
     return nn.GroupNorm(gcd(GROUPS, channels), channels) if norm == "group" else nn.Identity()
 
 
-def check_options(width: int, levels: int, norm: str) -> None:
-    """Check the options of a U-Net.
-
-    Raises:
-        ValueError: no channels or levels, or an unknown normalisation.
+def descended(blocks: nn.ModuleList, x: Float[Tensor, "n c d h w"]) -> list[Tensor]:
+    """The outputs of the blocks of each level, the finest first, with max-pooling over 2x2x2 voxels
+    between levels and smaller windows at odd ends.
     """
-    if min(width, levels) < 1:
-        raise ValueError(
-            f"A U-Net needs at least one channel and one level, got width={width}, levels={levels}"
-        )
-    check_choice("norm", norm, get_args(Norm))
-
-
-def pooled(x: Float[Tensor, "n c d h w"]) -> Float[Tensor, "n c e i x"]:
-    """Max-pooling over 2x2x2 voxels, with smaller windows at odd ends."""
-    return F.max_pool3d(x, 2, ceil_mode=True)
+    outputs: list[Tensor] = []
+    for block in blocks:
+        outputs.append(block(F.max_pool3d(outputs[-1], 2, ceil_mode=True) if outputs else x))
+    return outputs
 
 
 def middle(x: Float[Tensor, "n c d h w"], size: torch.Size) -> Float[Tensor, "n c e i x"]:

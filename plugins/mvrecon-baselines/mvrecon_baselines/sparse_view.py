@@ -9,17 +9,15 @@ and all networks initially return zero: before training, the volume is the filte
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.rigid import unit
 from mvrecon.methods.classical.fdk import Filter, fbp, fdk
-from mvrecon.methods.classical.orbit import Orbit, orbit_of
+from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.learned.geometry import validated
 from mvrecon.methods.learned.start import content_scale, nonzero, typical_chord
 from mvrecon.methods.method import Reconstruction
@@ -196,8 +194,7 @@ class Upsampling:
         count = len(order) * factor - (0 if closed else factor - 1)
         turns = (gaps[:, None] * torch.arange(factor).to(gaps) / factor).flatten()[:count]
         before = order.repeat_interleave(factor)[:count]
-        cameras = turned(A.cameras[before], orbit, turns)
-        dense = RayTransform(A.grid, cameras).to(A.device)
+        dense = RayTransform(A.grid, orbit.turned(A.cameras[before], turns)).to(A.device)
         return cls(order.to(A.device), factor, closed, dense)
 
     def __call__(self, views: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c n v u"]:
@@ -206,25 +203,6 @@ class Upsampling:
         after = views.roll(-1, dims=2)
         steps = [torch.lerp(views, after, k / self.factor) for k in range(self.factor)]
         return torch.stack(steps, dim=3).flatten(2, 3)[:, :, : self.dense.range_shape[0]]
-
-
-def turned(cameras: Cameras, orbit: Orbit, degrees: Float[Tensor, " m"]) -> Cameras:
-    """Rotate each camera about the orbit's axis by its own angle in degrees."""
-    x, y, z = unit(orbit.axis).tolist()
-    cross = orbit.axis.new_tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angles = torch.deg2rad(degrees)[:, None, None]
-    # Rodrigues' formula
-    R = torch.eye(3).to(cross) + angles.sin() * cross + (1 - angles.cos()) * (cross @ cross)
-
-    def rotated(vector: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3"]:
-        return torch.einsum("mij,mj->mi", R, vector.to(R))
-
-    source, origin = (
-        orbit.centre + rotated(point - orbit.centre) for point in (cameras.source, cameras.origin)
-    )
-    return replace(
-        cameras, source=source, origin=origin, u=rotated(cameras.u), v=rotated(cameras.v)
-    )
 
 
 def filtered(

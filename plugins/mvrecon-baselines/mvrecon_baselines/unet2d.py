@@ -31,11 +31,7 @@ class UNet2d(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, width: int = 32, levels: int = 4, zero: int = 0):
         super().__init__()
-        if min(width, levels) < 1:
-            raise ValueError(
-                f"A U-Net needs at least one channel and one level, got width={width}, "
-                f"levels={levels}"
-            )
+        check_sizes(width, levels)
         widths = [width * 2**level for level in range(levels)]
         pairs = list(zip(widths, widths[1:], strict=False))
         self.down = nn.ModuleList(
@@ -61,6 +57,18 @@ class UNet2d(nn.Module):
             x = F.interpolate(self.reduce[level](x), size=skip.shape[2:], mode="bilinear")
             x = self.up[level](x + skip)
         return self.last(x)
+
+
+def check_sizes(width: int, levels: int) -> None:
+    """Check the sizes of a U-Net.
+
+    Raises:
+        ValueError: no channel, or no level.
+    """
+    if min(width, levels) < 1:
+        raise ValueError(
+            f"A U-Net needs at least one channel and one level, got width={width}, levels={levels}"
+        )
 
 
 class ConvBlock2d(nn.Module):

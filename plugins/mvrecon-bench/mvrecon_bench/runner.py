@@ -4,7 +4,6 @@ import os
 import platform
 from collections import Counter
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -115,22 +114,13 @@ def markdown_of(bench: Bench, rows: Sequence[Row], summary: str) -> str:
 def machine() -> dict[str, str]:
     """Processor, threads, GPU, and versions of the libraries compared."""
     has_gpu = torch.cuda.is_available()
-    facts = {
-        **run_folder.versions(),
+    return {
+        **run_folder.versions(*PEERS),
         "processor": processor(),
         "cores": str(os.cpu_count()),
         "threads": str(torch.get_num_threads()),
         "gpu": torch.cuda.get_device_name() if has_gpu else "none",
     }
-    return facts | {name: version_of(name) for name in PEERS}
-
-
-def version_of(distribution: str) -> str:
-    """The version of a distribution, or "not installed"."""
-    try:
-        return metadata.version(distribution)
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def processor() -> str:

@@ -297,9 +297,7 @@ def test_totals_are_drawn_within_their_range():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"events": {"count": 0}}, "events.count of at least 1"),
         ({"events": {"count": 2, "totals": [9, 3]}}, "totals that ascend"),
-        ({"events": {"count": 2, "totals": [9]}}, r"events.totals as \[least, most\], got \[9\]"),
         ({"acquisition": {}}, "acquisition.counts or events.totals"),
         ({"acquisition": {"photons": 10.0}, "events": {"count": 1, "totals": [1, 2]}}, "photons"),
         ({"acquisition": {"counts": 1e3, "noise": 1.0}}, "electronic noise"),
@@ -315,8 +313,14 @@ def test_invalid_event_settings_are_refused(change, message):
     ("change", "message"),
     [
         ({"seed": 1.5}, "seed as a whole number, got 1.5"),
-        ({"events": None}, "events as settings by name, got None"),
-        ({"events": {"count": 1, "backprojection": "nope"}}, "as true or false, got 'nope'"),
+        ({"events": None}, "events is a mapping of count, first, .*got None"),
+        ({"events": {"count": 0}}, "events.count: expected int > 0, got 0"),
+        ({"events": {"count": True}}, "events.count: expected int > 0, got True"),
+        ({"events": {"count": 2, "bins": 0}}, "events.bins: expected int > 0 or null, got 0"),
+        ({"events": {"count": 2, "first": -1}}, "events.first: expected int >= 0, got -1"),
+        ({"events": {"count": 2, "totals": [9]}}, r"events.totals: expected .*, got \[9\]"),
+        ({"events": {"count": 2, "totals": [0, 9]}}, r"events.totals: expected .*got \[0, 9\]"),
+        ({"events": {"count": 1, "backprojection": "nope"}}, "expected bool, got 'nope'"),
     ],
 )
 def test_settings_of_the_wrong_type_are_refused(change, message):

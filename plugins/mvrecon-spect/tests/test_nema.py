@@ -28,6 +28,16 @@ def test_spheres_have_their_volumes_and_the_contrast_to_the_body():
     assert mu.sum().item() * 64 == pytest.approx(body, rel=2e-3)
 
 
+@pytest.mark.parametrize("diameters", [(20.0,), (20.0, 30.0)])
+def test_a_body_may_have_fewer_spheres(diameters):
+    grid = Grid.centred(size=(54, 50, 34), spacing=4.0)
+    phantom = Nema(value=8.0, diameters=diameters).phantom(generator(0, 0), grid)
+    spheres = sum(math.pi / 6 * d**3 for d in diameters)
+    total = 2 * math.pi * 100 * 90 * 120 + 6 * spheres
+    assert voxelise(phantom, grid).sum().item() * 64 == pytest.approx(total, rel=2e-3)
+    assert phantom.values(torch.tensor([[CIRCLE, 0.0, 0.0]])).item() == pytest.approx(8.0)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [

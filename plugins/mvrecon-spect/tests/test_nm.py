@@ -327,7 +327,7 @@ CONTRADICTIONS = {
         ({"DetectorVector": [1, 3] * 6}, "every view once|DetectorInformationSequence has 2 items"),
     ],
     "angles": [
-        (turn(StartAngle=45.0), "StartAngle of the rotation that a detector has"),
+        (turn(StartAngle=45.0), "StartAngle of RotationInformationSequence in Det"),
         (turn(AngularStep=-30.0), "AngularStep not negative"),
         (turn(ScanArc=200.0), "ScanArc of 90 .*got 200"),
         (turn(NumberOfFramesInRotation=2, ScanArc=None), "NumberOfFramesInRotation 2"),
@@ -337,7 +337,10 @@ CONTRADICTIONS = {
     "radii": [
         (turn(RadialPosition=[250.0, 251.0]), "RadialPosition has one finite number or 3"),
         (turn(RadialPosition=[250.0] * 6), "RadialPosition has one finite number or 3"),
-        (heads(RadialPosition=[240.0, 241.0, 242.0]), "RadialPosition of the rotation"),
+        (
+            heads(RadialPosition=[240.0, 241.0, 242.0]),
+            "RadialPosition of RotationInformationSequence in Det",
+        ),
     ],
     "durations and sizes": [
         ({"ActualFrameDuration": 10000}, "ActualFrameDuration of the image"),

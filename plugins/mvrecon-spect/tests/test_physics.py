@@ -246,4 +246,18 @@ def test_impossible_options_are_refused(options, told):
 def test_a_pinhole_inside_the_object_is_refused():
     """A pinhole inside the grid of the activity is refused."""
     with pytest.raises(ValueError, match="pinhole 0 in it"):
-        Spect(Grid.centred(10, spacing=60.0), dcspect80(pixels=4))
+        Spect(Grid.centred(10, spacing=80.0), dcspect80(pixels=4))
+
+
+@pytest.mark.parametrize(
+    ("shares", "first"), [((0.9, 1.5, 0.5), 2), ((0.7, 0.9, 0.5), 0), ((0.99, 0.81, 0.79), 2)]
+)
+def test_the_refused_pinhole_is_named(shares, first):
+    """Not one near the grid's surface, which is accepted. Shares: of the way from the grid's centre
+    to the ellipsoid inscribed in its box.
+    """
+    grid, rig = Grid.centred(10, spacing=8.0), dcspect80(pixels=4)[[0, 20, 40]]
+    reach = rig.source.new_tensor(shares)[:, None] * 40.0 / rig.source.norm(dim=1, keepdim=True)
+    moved = replace(rig, source=reach * rig.source, origin=rig.origin + (reach - 1) * rig.source)
+    with pytest.raises(ValueError, match=f"got pinhole {first} in it"):
+        Spect(grid, moved)

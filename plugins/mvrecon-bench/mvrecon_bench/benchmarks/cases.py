@@ -105,9 +105,7 @@ def boxes(field: float) -> Phantom:
     halves = torch.tensor([[12, 10, 11], [3, 4, 2], [2, 3, 5]])
     values = torch.tensor([0.4, 0.5, -0.3])
     step = field / 32
-    return Phantom(
-        (Solids("box", centres * step, torch.eye(3).expand(3, 3, 3), halves * step, values),)
-    )
+    return Phantom((Solids.upright("box", centres * step, halves * step, values),))
 
 
 def case_label(row: Mapping[str, Any]) -> str:

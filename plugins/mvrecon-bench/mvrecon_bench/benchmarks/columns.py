@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 MEDIAN = "median of at least `repeats` calls"
-#: Those of several benchmarks.
+#: Columns of several benchmarks.
 SHARED = {
     "part": "projector or method, by its name in the registry",
     "method": "option of a projector of that name, where it has one",

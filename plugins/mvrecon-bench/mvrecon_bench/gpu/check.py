@@ -5,8 +5,6 @@ about 2 minutes.
 """
 
 import math
-import subprocess
-import sys
 import time
 import warnings
 from collections import Counter
@@ -19,6 +17,7 @@ from torch import Tensor
 
 import mvrecon as mv
 from mvrecon.core.parts import PROJECTORS
+from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.geometry.lattice import depth_edges, grid_lattice, lattice_maps
 from mvrecon.kernels import self_test, voxels, warps
 from mvrecon.kernels.rays import ops
@@ -31,12 +30,11 @@ from mvrecon.testing.measures import inner_product_gap
 from mvrecon.training.run_folder import versions
 from mvrecon_bench.gpu.measuring import Results, on_device, options_of
 from mvrecon_bench.measure import throughput
-from mvrecon_bench.runner import version_of
+from mvrecon_bench.stresses.fresh_process import python
 from mvrecon_spect.operators import footprints
 from mvrecon_spect.operators.projector import Spect
 
 SKIPS = ("off", "auto", "box")
-VECTORS = ("source", "origin", "u", "v")
 #: Linear attenuation in 1/mm before pinholes; voxels along an edge of the hull's bricks.
 MU, BRICK = 0.015, 4
 #: The result of the self-check is permanent: a first call in one of these modes must not make it
@@ -218,8 +216,7 @@ def first_call(name: str, device: str) -> str:
     """The back end used by a new process whose first call is made in a mode."""
     mode, call = FIRST_CALLS[name]
     code = FIRST_CALL.replace("MODE", mode).replace("CALL", call).replace("DEVICE", device)
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=90, check=False)
+    done = python("-c", code)
     return done.stdout.strip() or done.stderr.strip()[-300:]
 
 
@@ -292,7 +289,7 @@ def main() -> None:
     options = options_of(__doc__, n=48, modes=[*FIRST_CALLS])
     device, n = on_device(options.device), options.n
     results = Results(options.out, "check")
-    results.add("versions", versions() | {"triton": version_of("triton")})
+    results.add("versions", versions("triton"))
     if device == "cuda":
         results.attempt("machine", machine)
         self_checks(results)

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 import mvrecon as mv
+from mvrecon.geometry.cameras.camera import VECTORS
 
-VECTORS = ("source", "origin", "u", "v")
 Call = Callable[[Tensor], Tensor]
 
 

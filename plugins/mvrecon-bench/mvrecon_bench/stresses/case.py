@@ -8,9 +8,13 @@ from typing import Any
 
 import torch
 
+from mvrecon.testing.measures import greatest
+
 #: Subjects of cases: a kind of part, or the common base of all parts (tensors, geometry, threads),
 #: tested once.
 KINDS = ("projector", "camera", "scene", "head", "method", "mvrecon")
+#: What a case's function returns.
+Measure = Callable[[Any], "float | Iterator[float]"]
 DOUBLE, SINGLE = (torch.float64,), (torch.float32,)
 BOTH, HALVES = DOUBLE + SINGLE, (torch.bfloat16, torch.float16)
 EVERY = BOTH + HALVES
@@ -65,14 +69,24 @@ def case(
     number: int,
     tolerance: float | Mapping[torch.dtype, float] = 0.0,
     dtypes: Sequence[torch.dtype] = BOTH,
-) -> Callable[[Callable[[Any], float]], Callable[[Any], float]]:
-    """Make a function a case, whose docstring is `name: property`; see `Case` for the arguments."""
+) -> Callable[[Measure], Measure]:
+    """Make a function a case, whose docstring is `name: property`; see `Case` for the arguments.
 
-    def described(measure: Callable[[Any], float]) -> Callable[[Any], float]:
-        name, _, holds = " ".join(str(measure.__doc__).split()).rstrip(".").partition(": ")
+    The function returns the measured number, or yields several: errors, of which the greatest
+    counts, or with a tolerance of zero numbers of violations, which add up.
+    """
+
+    def described(function: Measure) -> Measure:
+        def measure(subject: Any) -> float:
+            found = function(subject)
+            if not isinstance(found, Iterator):
+                return found
+            return float(sum(found)) if tolerance == 0 else greatest(found)
+
+        name, _, holds = " ".join(str(function.__doc__).split()).rstrip(".").partition(": ")
         row = Case(number, name, holds, kind, measure, tolerance, dtypes)
-        measure.case = row  # pyrefly: ignore[missing-attribute]
-        return measure
+        function.case = row  # pyrefly: ignore[missing-attribute]
+        return function
 
     return described
 

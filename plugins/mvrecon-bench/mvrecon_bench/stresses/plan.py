@@ -15,7 +15,8 @@ from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.rows import Bench, Job, Row, figure, markdown
 from mvrecon_bench.stresses.case import KINDS, Case
-from mvrecon_bench.stresses.subject import Subject, subject_of
+from mvrecon_bench.stresses.subject import Subject
+from mvrecon_bench.stresses.subjects import subject_of
 from mvrecon_bench.stresses.verdict import COLUMNS, FAIL, LEFT_OUT, LIMIT, PASS, identity, judge
 
 #: Modules of cases.

@@ -4,7 +4,6 @@ import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from importlib import import_module
 from typing import Any
 
 import torch
@@ -257,19 +256,3 @@ def cropped(rig: Cameras, row: int, column: int, shape: tuple[int, int]) -> Came
     shift = row * rig.v + column * rig.u
     source = rig.source + shift if rig.parallel else rig.source
     return replace(rig, source=source, origin=rig.origin + shift, shape=shape)
-
-
-#: Specialised subjects as import strings, since their modules import this one.
-SUBJECTS = {
-    "projector": "mvrecon_bench.stresses.subject:ProjectorSubject",
-    "camera": "mvrecon_bench.stresses.subjects:CameraSubject",
-    "scene": "mvrecon_bench.stresses.subjects:SceneSubject",
-    "head": "mvrecon_bench.stresses.subjects:HeadSubject",
-    "method": "mvrecon_bench.stresses.subjects:MethodSubject",
-}
-
-
-def subject_of(kind: str, *arguments: Any) -> Subject:
-    """Build a subject of a kind; see `Subject` for the arguments."""
-    module, _, name = SUBJECTS.get(kind, "mvrecon_bench.stresses.subject:Subject").partition(":")
-    return getattr(import_module(module), name)(kind, *arguments)

@@ -26,7 +26,7 @@ from mvrecon.operators.operator import Projector
 from mvrecon.testing.measures import gap
 from mvrecon.testing.scene import GRID as FIELD, RIG
 from mvrecon_bench.stresses.case import DoesNotApply, inapplicable
-from mvrecon_bench.stresses.subject import DETECTOR, Subject
+from mvrecon_bench.stresses.subject import DETECTOR, ProjectorSubject, Subject
 
 #: Values of required options of cameras.
 SMALL: dict[str, Any] = {
@@ -259,3 +259,14 @@ class MethodSubject(Subject):
         with torch.no_grad():
             volume, other = (self.used(scale * self.views[:1]).volume for scale in (1, 8))
         return gap(other / 8, volume) < 1e-3
+
+
+SUBJECTS = {
+    **{"projector": ProjectorSubject, "camera": CameraSubject, "scene": SceneSubject},
+    **{"head": HeadSubject, "method": MethodSubject, "mvrecon": Subject},
+}
+
+
+def subject_of(kind: str, *arguments: Any) -> Subject:
+    """Build a subject of a kind; see `Subject` for the arguments."""
+    return SUBJECTS[kind](kind, *arguments)

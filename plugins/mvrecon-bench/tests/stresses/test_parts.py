@@ -14,7 +14,7 @@ from mvrecon.operators.drr import Drr
 from mvrecon.operators.operator import Wrapped
 from mvrecon_bench.stresses import plan
 from mvrecon_bench.stresses.case import DoesNotApply
-from mvrecon_bench.stresses.subject import subject_of
+from mvrecon_bench.stresses.subjects import subject_of
 from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, judge
 
 DETECTOR = {"pixels": 4, "pixel_mm": 2.0}

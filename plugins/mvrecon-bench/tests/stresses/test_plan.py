@@ -2,12 +2,14 @@
 should.
 """
 
+import math
+
 import pytest
 import torch
 
 from mvrecon.core.parts import REGISTRIES
-from mvrecon_bench.stresses import plan
-from mvrecon_bench.stresses.subject import subject_of
+from mvrecon_bench.stresses import case as cases, plan
+from mvrecon_bench.stresses.subjects import subject_of
 from mvrecon_bench.stresses.verdict import FAIL, judge
 from tests.covering import takes_long
 
@@ -59,3 +61,23 @@ def test_the_plan_holds(case, subject):
     assert row["verdict"] != FAIL, (
         f"{case.holds}: {row['measured']} > {row['tolerance']} {row['note']}"
     )
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "numbers", "measured"),
+    [
+        (0.5, (0.1, 0.3, 0.2), 0.3),
+        (cases.EXACT, (-1.0, -2.0), -1.0),
+        (0.0, (1, True, 2.0), 4.0),
+        (0.0, (), 0.0),
+        (0.5, (0.1, math.nan, 0.2), math.nan),
+        (0.0, (0, math.nan), math.nan),
+    ],
+)
+def test_a_case_measures_its_greatest_error_or_all_of_its_violations(tolerance, numbers, measured):
+    @cases.case("mvrecon", 1, tolerance)
+    def some(_):
+        """Numbers: none is too large."""
+        yield from numbers
+
+    assert some.case.measure(None) == pytest.approx(measured, nan_ok=True)

@@ -7,7 +7,7 @@ import json
 import math
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,11 @@ from torch.utils.data import DataLoader
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
 from mvrecon.core.numbers import generator, mixed, uniform
+from mvrecon.core.options import check_value
 from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES
+from mvrecon.core.quantities import NonNegativeInt, Pair, PositiveFloat, PositiveInt
 from mvrecon.core.registry import from_options
+from mvrecon.core.signatures import options_of
 from mvrecon.data.acquisition.acquired import NOISE, Acquired
 from mvrecon.data.acquisition.detector import Acquisition, counted, emitted
 from mvrecon.data.digests import files_in, of_file
@@ -94,52 +97,24 @@ class EventSettings:
         backprojection: whether to store the back-projection of the counts.
 
     Raises:
-        TypeError: an option of the wrong type.
-        ValueError: numbers that are too small.
+        TypeError: an option of another type or range.
+        ValueError: totals that do not ascend.
     """
 
-    count: int
-    first: int = 0
-    shard: int = 32
-    workers: int = 2
-    totals: tuple[float, float] | None = None
-    angles: int = 256
-    bins: int | None = None
+    count: PositiveInt
+    first: NonNegativeInt = 0
+    shard: PositiveInt = 32
+    workers: NonNegativeInt = 2
+    totals: Pair[PositiveFloat] | None = None
+    angles: NonNegativeInt = 256
+    bins: PositiveInt | None = None
     backprojection: bool = False
 
     def __post_init__(self) -> None:
-        least = {"count": 1, "first": 0, "shard": 1, "workers": 0, "angles": 0, "bins": 1}
-        for name, value in asdict(self).items():
-            if name in ("totals", "backprojection") or (name == "bins" and value is None):
-                continue
-            if not isinstance(value, int) or isinstance(value, bool):
-                raise TypeError(f"Expected events.{name} as a whole number, got {value!r}")
-            if value < least[name]:
-                raise ValueError(f"Expected events.{name} of at least {least[name]}, got {value}")
-        if not isinstance(self.backprojection, bool):
-            raise TypeError(
-                f"Expected events.backprojection as true or false, got {self.backprojection!r}"
-            )
-        if self.totals is not None:
-            low, high = self.totals
-            if not 0 < low <= high < float("inf"):
-                raise ValueError(f"Expected events.totals that ascend above 0, got {low}, {high}")
-
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "EventSettings":
-        """Parse settings from a mapping.
-
-        Raises:
-            TypeError: not a mapping, an unknown option, or a missing required one.
-            ValueError: `totals` that are not two numbers.
-        """
-        if not isinstance(options, Mapping):
-            raise TypeError(f"Expected events as settings by name, got {options!r}")
-        if (totals := options.get("totals")) is not None:
-            if not isinstance(totals, list | tuple) or len(totals) != 2:
-                raise ValueError(f"Expected events.totals as [least, most], got {totals!r}")
-            options = {**options, "totals": tuple(map(float, totals))}
-        return from_options(cls, "A data set of events", options)
+        for name, option in options_of(EventSettings)[0].items():
+            check_value(f"events.{name}", getattr(self, name), option)
+        if self.totals is not None and not self.totals[0] <= self.totals[1] < math.inf:
+            raise ValueError(f"Expected events.totals that ascend, got {list(self.totals)}")
 
     @property
     def shards(self) -> int:
@@ -215,7 +190,8 @@ class EventMaker:
         grid, cameras = Grid.centred(**settings["grid"]), CAMERAS.from_config(settings["camera"])
         scene = SCENES.from_config(settings["scene"])
         acquired = Acquired(scene, settings["projector"], Acquisition.of(settings["acquisition"]))
-        return cls(acquired, grid, cameras, settings["seed"], EventSettings.of(settings["events"]))
+        events = from_options(EventSettings, "events", settings["events"])
+        return cls(acquired, grid, cameras, settings["seed"], events)
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -76,12 +76,8 @@ class Header:
         Raises:
             Refused: not a number, or the key is missing and there is no default.
         """
-        try:
-            return number(self.text(key, None if default is None else repr(default)), repr(key))
-        except ValueError as error:
-            raise (
-                error if isinstance(error, Refused) else Refused(f"{self.path}: {error}")
-            ) from None
+        text = self.text(key, None if default is None else repr(default))
+        return number_in(self.path, text, repr(key))
 
     def positive(self, key: str, default: float | None = None) -> float:
         """The value of a key as a positive number.
@@ -105,6 +101,18 @@ class Header:
         return int(value)
 
 
+def number_in(path: Path, text: str, what: str) -> float:
+    """A finite number in a file's text.
+
+    Raises:
+        Refused: not a number.
+    """
+    try:
+        return number(text, what)
+    except ValueError as error:
+        raise Refused(f"{path}: {error}") from None
+
+
 def read_header(path: str | Path, content: Content) -> Header:
     """Read an Interfile header, and check the keys that change values or places.
 
@@ -114,12 +122,12 @@ def read_header(path: str | Path, content: Content) -> Header:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        Refused: not an Interfile header, a truncated one, a key with two values, a key to refuse,
-            a known one with "%" or an index that it has not, or an unknown one with a word of
-            `EFFECT` or the name of a known one but for a slip.
+        Refused: the file is no Interfile header or is truncated; a key has two values, or a value
+            that its table refuses; a known key has "%" or an index that it does not have; or an
+            unknown key contains a word of `EFFECT` or is a known one with a misspelling.
 
     Warns:
-        UserWarning: no end of the header behind its last line, which is whole.
+        UserWarning: the header has no end, although its last line is complete.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -222,7 +230,7 @@ def _check_key(
 def _two_values(
     path: Path, key: str, first: str, second: str, pairs: Sequence[tuple[_Name, str]]
 ) -> str:
-    """The message for a key with two values: remove one, or separate a header's sections."""
+    """The message for a key with two values: remove one, or split the header's sections."""
     stated = {name.base: value.strip() for name, value in pairs}
     sections = [f"{name!r} := {stated[name]}" for name in SECTIONS if stated.get(name, "1") != "1"]
     cure = (

@@ -205,7 +205,7 @@ EFFECT = re.compile(
 )
 #: Values of such a key that change nothing, by its words: 1 of slopes, 0 of offsets.
 EFFECTS = {EFFECT.pattern: None, **keys.EFFECTS, r"\blog|\bpower|correct": None}
-#: Similarity of an unknown key to one of the tables, by `difflib`, from which it may be a slip.
+#: Similarity, by `difflib`, from which an unknown key may be a misspelled key of the tables.
 SLIP = 0.9
 #: Values of an unknown key that has no effect.
 NOTHING = {"", "none", "unknown", "{}", "{none}"}

@@ -29,11 +29,11 @@ PER_CM = 0.1
 DENSEST = 0.1
 #: In 1/cm: if no voxel exceeds it, the values may be in 1/mm; lung has about 0.04 at 140.5 keV.
 THIN = 0.03
-#: The header's key for the centre of the first voxel, one an axis.
+#: The header's key for the centre of the first voxel, one per axis.
 OFFSET = "first pixel offset (mm)"
 #: The `originating system` of files that mvrecon writes, in lower case.
 SYSTEM = "mvrecon"
-#: Tolerances in voxels: of STIR's offsets, which have six digits; and of axes that are no others.
+#: Tolerances in voxels: of STIR's offsets, which have six digits, and of axes along x, y and z.
 ROUNDED, STRAIGHT = 1e-3, 1e-6
 
 
@@ -91,7 +91,7 @@ def read_interfile(
 
 
 def _only(header: Header, key: str, other: str) -> bool:
-    """Whether a header has a key without another of the same meaning."""
+    """Whether a header has a key, but not another one with the same meaning."""
     return bool(header.values.get(key)) and not header.values.get(other)
 
 
@@ -220,4 +220,4 @@ def write_mu(path: str | Path, mu: Float[Tensor, "d h w"], grid: Grid) -> None:
         ValueError: values that cannot be attenuation in 1/mm; see `write_interfile_volume`.
     """
     check_mu(mu, grid)
-    write_interfile_volume(path, mu.double() / PER_CM, grid)  # of half precision too
+    write_interfile_volume(path, mu.double() / PER_CM, grid)  # also from half precision

@@ -8,7 +8,6 @@ and increase towards the patient's left (counter-clockwise, viewed from the feet
 
 from collections.abc import Iterator, Sequence
 from datetime import datetime
-from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +34,7 @@ DESCRIBED = {
     "RotationVector": "RotationInformationSequence",
     "PhaseVector": "PhaseInformationSequence",
 }
+DURATION = "ActualFrameDuration"
 COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1")
 #: Attributes of measured views besides `mvrecon.data.dicom_image.KEYS`.
 KEYS = (
@@ -75,7 +75,7 @@ KEYS = (
     Key("ScanArc, NumberOfFramesInRotation", "compared", "with AngularStep and AngularViewVector"),
     Key("RadialPosition", "applied", "as StartAngle; one value, or one of each view"),
     Key(
-        "ActualFrameDuration",
+        DURATION,
         "applied",
         "of the phase, else of the rotation, else of the image; these must have one in common; "
         "unknown of gated frames; 0: not stated",
@@ -212,11 +212,11 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
     if (pixel_mm := image.pixel_mm("PixelSpacing")) is None:
         raise Refused(f"{path}: expected PixelSpacing in mm, got none")
     with file_errors(path, "describes its windows, detectors, rotations or phases wrongly"):
-        named = (*DESCRIBED.values(), "GatedInformationSequence", "ActualFrameDuration")
+        named = (*DESCRIBED.values(), "GatedInformationSequence", DURATION)
         dataset = {name: image.value(name) for name in named}
         _check_starts(path, dataset, known)
         _check_rotations(path, dataset, known)
-        _check_durations(path, dataset, known)
+        _check_stated(path, dataset, known)
         views = tuple(_view(dataset, key, known) for key in known)
         energies = tuple(_window(dataset, index) for index in windows)
         frames = [_frame(dataset, moment, moments) for moment in moments]
@@ -295,7 +295,7 @@ def frame_numbers(image: DicomImage, name: str) -> list[int]:
 
 
 def _check_numbered(image: DicomImage) -> None:
-    """Raise if a vector is missing that says which of several unequal items a frame belongs to."""
+    """Raise if the items of a sequence differ and no vector assigns the frames to them."""
     for vector, name in DESCRIBED.items():
         items = image.value(name) or []
         if image.value(vector) is None and any(item != items[0] for item in items):
@@ -333,8 +333,8 @@ def _window(dataset: Any, index: int) -> EnergyWindow:
 
 
 def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
-    """Raise if several detectors would get the same angles because only rotations state a start
-    angle, or each of several.
+    """Raise if the file does not say where each of several detectors starts: the rotation alone
+    states an angle, or each of several rotations states its own.
     """
     turns = {view[1] for view in views}
     starts = {n: _start(dataset, "RotationInformationSequence", n) for n in sorted(turns)}
@@ -363,28 +363,17 @@ def _check_starts(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]
 
 def _start(dataset: Any, name: str, index: int) -> float | None:
     """The start angle in an item of a sequence in degrees; None if there is none."""
-    return _number("StartAngle", _item(dataset, name, index), 0, 1)
+    return _number("StartAngle", _item(dataset, name, index))
 
 
 def _check_rotations(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
-    """Raise for rotations whose angles or views contradict each other, the detectors or the
-    vectors.
-    """
+    """Raise for rotations whose arcs or views contradict their steps or the vectors."""
     heads = dataset.get("DetectorInformationSequence") or []
     turns = dataset.get("RotationInformationSequence") or []
-    for name in ("StartAngle", "RadialPosition"):
-        stated = [[item.get(name) for item in items] for items in (heads, turns)]
-        own, of_turns = ([v for v in values if v not in (None, "")] for values in stated)
-        if own and of_turns and not any(_alike(name, a, b) for a in own for b in of_turns):
-            raise Refused(
-                f"{path}: expected a {name} of the rotation that a detector has as well, got "
-                f"{shown(of_turns)} of RotationInformationSequence and {shown(own)} of "
-                f"DetectorInformationSequence; keep those that are meant"
-            )
     for number, turn in enumerate(turns, 1):
         last = max((view[2] for view in views if view[1] == number), default=0)
-        step, arc = (_number(name, turn, 0, 1) for name in ("AngularStep", "ScanArc"))
-        count = int(_number("NumberOfFramesInRotation", turn, 0, 1) or last)
+        step, arc = (_number(name, turn) for name in ("AngularStep", "ScanArc"))
+        count = int(_number("NumberOfFramesInRotation", turn) or last)
         if last > count or (step or 0) < 0:
             raise Refused(
                 f"{path}: expected AngularViewVector up to NumberOfFramesInRotation {count} and an "
@@ -400,7 +389,11 @@ def _check_rotations(path: Path, dataset: Any, views: Sequence[tuple[int, int, i
 
 
 def _alike(name: str, one: Any, other: Any) -> bool:
-    """Whether two start angles are one, or two lists of radii, or a radius one of a list."""
+    """Whether two start angles, durations or lists of radii are equal, or a list contains a
+    radius.
+    """
+    if name == DURATION:
+        return same(float(one), float(other))
     a, b = (np.atleast_1d(value).astype(float) for value in (one, other))
     if name == "StartAngle":
         return bool(abs((a[0] - b[0] + 180) % 360 - 180) < 0.1)
@@ -409,25 +402,25 @@ def _alike(name: str, one: Any, other: Any) -> bool:
     return 1 in (len(a), len(b)) and bool((abs(a - b) < 0.1).any())
 
 
-def _check_durations(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
-    """Raise for frame durations that contradict one another: the image's is none of its rotations'
-    or phases', or that of a rotation of several views is none of its phases'.
-    """
-    name, rotation = "ActualFrameDuration", "RotationInformationSequence"
-    groups = {"the image": [dataset]}
-    groups |= {key: dataset.get(key) or [] for key in (rotation, "PhaseInformationSequence")}
-    stated = {
-        place: [float(item.get(name)) for item in items if item.get(name) not in (None, "", 0)]
-        for place, items in groups.items()
-    }
-    turns = len({view[2] for view in views}) > 1
-    for (place, own), (other, found) in combinations(stated.items(), 2):
-        if place == rotation and not turns:
-            continue  # one view, as of a file that was made from a tomogram's
-        if own and found and not any(same(a, b) for a in own for b in found):
+def _check_stated(path: Path, dataset: Any, views: Sequence[tuple[int, int, int]]) -> None:
+    """Raise if two places state start angles, radii or frame durations, but none in common."""
+    image, heads = "the image", "DetectorInformationSequence"
+    turns, phases = "RotationInformationSequence", "PhaseInformationSequence"
+    items = {image: [dataset]} | {key: dataset.get(key) or [] for key in (heads, turns, phases)}
+    pairs = [("StartAngle", turns, heads), ("RadialPosition", turns, heads)]
+    pairs += [(DURATION, image, turns), (DURATION, image, phases)]
+    if len({view[2] for view in views}) > 1:  # else the file may be made from one of a tomogram
+        pairs.append((DURATION, turns, phases))
+    for name, place, other in pairs:
+        unstated = (None, "", 0) if name == DURATION else (None, "")
+        own, found = (
+            [item.get(name) for item in items[key] if item.get(name) not in unstated]
+            for key in (place, other)
+        )
+        if own and found and not any(_alike(name, a, b) for a in own for b in found):
             raise Refused(
                 f"{path}: expected the {name} of {place} in {other}, got {shown(own)} and "
-                f"{shown(found)} ms; keep the one that is meant"
+                f"{shown(found)}; keep the one that is meant"
             )
 
 
@@ -440,15 +433,15 @@ def _view(dataset: Any, key: tuple[int, int, int], views: Sequence[tuple[int, in
     own = _item(dataset, "DetectorInformationSequence", detector)
     turns = {view[1] for view in views}
     turn = _item(dataset, "RotationInformationSequence", rotation)
-    count = int(_number("NumberOfFramesInRotation", turn, 0, 1) or count)
+    count = int(_number("NumberOfFramesInRotation", turn) or count)
     first, second = (own, turn) if len(turns) < 2 else (turn, own)
 
-    def stated(name: str, index: int, most: int) -> float | None:
+    def stated(name: str, index: int = 0, most: int = 1) -> float | None:
         value = _number(name, first, index, most)
         return _number(name, second, index, most) if value is None else value
 
-    angle = stated("StartAngle", 0, 1)
-    if angle is not None and (step := _number("AngularStep", turn, 0, 1)) is not None:
+    angle = stated("StartAngle")
+    if angle is not None and (step := _number("AngularStep", turn)) is not None:
         if (direction := turn.get("RotationDirection")) not in ("CW", "CC"):
             raise ValueError(f"RotationDirection is CW or CC, got {shown(direction)}")
         angle = (angle + {"CW": -1, "CC": 1}[direction] * step * (number - 1)) % 360
@@ -470,7 +463,7 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
         for number in range(1, phase + 1):
             item = _item(dataset, "PhaseInformationSequence", number)
             delay, pause, count = (
-                _number(name, item, 0, 1) or 0.0
+                _number(name, item) or 0.0
                 for name in ("PhaseDelay", "PauseBetweenFrames", "NumberOfFramesInPhase")
             )
             pieces, duration = {p for n, p, *_ in moments if n == number}, _seconds(item)
@@ -484,7 +477,7 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
                 start += (delay + before * pause) / 1000 + before * (duration or 0.0)
         return Frame(*moment, start, duration)  # pyrefly: ignore[unbound-name]
     gate = _item(dataset, "GatedInformationSequence", 1)
-    step = _number("FrameTime", _item(gate, "DataInformationSequence", interval), 0, 1)
+    step = _number("FrameTime", _item(gate, "DataInformationSequence", interval))
     if step is None:
         return Frame(*moment, None, None)
     return Frame(*moment, (slot - 1) * step / 1000, step / 1000)
@@ -492,7 +485,7 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
 
 def _seconds(item: Any) -> float | None:
     """Duration of a frame in s; None if the item states none, or 0, as some programs write."""
-    if (duration := _number("ActualFrameDuration", item, 0, 1)) is not None and duration < 0:
+    if (duration := _number(DURATION, item)) is not None and duration < 0:
         raise ValueError(f"ActualFrameDuration is not negative, got {duration:g} ms")
     return duration / 1000 if duration else None
 
@@ -505,7 +498,7 @@ def _item(dataset: Any, name: str, index: int) -> Any:
     return items[index - 1] if items else {}
 
 
-def _number(name: str, item: Any, index: int, count: int) -> float | None:
+def _number(name: str, item: Any, index: int = 0, count: int = 1) -> float | None:
     """A finite number of an item, or that at an index of a list of `count`; None if it has none."""
     if (value := item.get(name)) is None or np.size(value) == 0 or value == "":
         return None

@@ -39,8 +39,8 @@ def dicom_views(path: Path, dataset: str | None = None) -> ProjectionStack:
 class NmViews(ProjectionStack):
     """Counts of a DICOM NM file, sorted by detector, rotation and angular view.
 
-    The detectors measure together, one angular view after the other without the time between them,
-    which NM does not have.
+    All detectors measure at the same time, one angular view after the other; the time between
+    views, which NM does not contain, is taken to be zero.
 
     Args:
         path: path of the file.

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.checks import Refused, file_errors, io_library, shown
+from mvrecon.core.files.checks import Refused, check_file, file_errors, io_library, shown
 from mvrecon.core.files.keys import Key
 from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.data.dicom import RAS
@@ -70,7 +70,7 @@ UNKNOWN = (
 class NmVolume(NamedTuple):
     """A volume of a DICOM NM file, its grid in world mm (RAS) and its unit in UCUM; start of the
     acquisition, duration of each view in s and administered activity in MBq, each None if the file
-    does not contain it, or several.
+    contains none or several.
     """
 
     volume: Float[Tensor, "d h w"]
@@ -199,8 +199,7 @@ def read_nm_volume(path: str | Path) -> NmVolume:
 def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
     """Open a reconstructed DICOM NM file for `mvrecon.read_volume`; see `read_nm_volume`."""
     path = Path(path).expanduser()
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; expected a DICOM NM volume")
+    check_file(path, "a DICOM NM volume")
     image = DicomImage(path)
     if (modality := str(image.value("Modality"))) != "NM":
         raise Refused(f"{path}: expected the modality NM, got {modality}")

@@ -1,6 +1,5 @@
 """The projector of a STIR system: holes, acceptance and the detector's blur from its files."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Unpack
@@ -18,9 +17,8 @@ from mvrecon_spect.files.stir_text import Opening
 from mvrecon_spect.operators.matter import MuOption
 from mvrecon_spect.operators.multiplexed import Multiplexed
 from mvrecon_spect.operators.projector import Shared, Spect
+from mvrecon_spect.operators.response import FWHM
 
-#: Ratio of a Gaussian's FWHM to its standard deviation.
-FWHM = math.sqrt(8 * math.log(2))
 #: Maximum distance of a camera from its position in the files, as a fraction of the distance from
 #: hole to detector.
 MOVED = 0.25

@@ -129,8 +129,7 @@ def cameras_of(system: StirSystem, world: str = "RAS") -> Cameras:
     Args:
         system: the geometry.
         world: axes of the file, see `mvrecon.geometry.cameras.formats.common.to_ras`. STIR's are
-            LPS for a
-            patient on his back, head first, and RAS for one on his belly, head first.
+            LPS for a patient on the back and RAS for one on the belly, both head first.
     """
     openings = system.openings
     index = [hole.detector for hole in openings]

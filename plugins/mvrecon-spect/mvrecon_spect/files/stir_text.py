@@ -13,11 +13,12 @@ from typing import Literal, NamedTuple
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, shown, text_of
-from mvrecon.geometry.cameras.formats.common import VIEWS, number
+from mvrecon.geometry.cameras.formats.common import VIEWS
+from mvrecon_spect.files.interfile import number_in
 
 #: mm per cm.
 CM = 10.0
-#: Units beside a name or a value, and those of lengths (and attenuation) and angles.
+#: Units that may follow a name or a value, and the units of lengths (and attenuation) and angles.
 UNIT = re.compile(
     r"(?<![a-z])(nm|[uµμ]?m|[mc]m|g|inch(?:es)?|deg(?:rees?)?|rad(?:ians?)?|°)(?![a-z])"
 )
@@ -119,16 +120,16 @@ def write_detector(path: str | Path, text: DetectorText) -> None:
     lines = [
         "Detector of a pinhole system, as STIR reads it",
         f"Number of rings: {len(text.rings)}",
-        f"Sigma (cm): {float(text.sigma_mm / CM)!r}",
-        f"Crystal thickness (cm): {float(text.crystal_mm / CM)!r}",
-        f"Crystal attenuation coefficient (cm -1): {float(text.crystal_mu * CM)!r}",
+        f"Sigma (cm): {_word(text.sigma_mm / CM)}",
+        f"Crystal thickness (cm): {_word(text.crystal_mm / CM)}",
+        f"Crystal attenuation coefficient (cm -1): {_word(text.crystal_mu * CM)}",
     ]
     for ring in text.rings:
         lines += [
             f"Nangles: {ring.count}",
-            f"ang0 (deg): {float(ring.first_degrees)!r}",
-            f"incr (deg): {float(ring.step_degrees)!r}",
-            f"z0 (cm): {float(ring.z_mm / CM)!r}",
+            f"ang0 (deg): {_word(ring.first_degrees)}",
+            f"incr (deg): {_word(ring.step_degrees)}",
+            f"z0 (cm): {_word(ring.z_mm / CM)}",
         ]
     with written_whole(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -165,8 +166,8 @@ def write_collimator(path: str | Path, text: CollimatorText) -> None:
     lines = [
         "Collimator of a pinhole system, as STIR reads it",
         f"Model (cyl/pol): {text.model}",
-        f"Collimator radius (cm): {float(text.radius_mm / CM)!r}",
-        f"Wall thickness (cm): {float(text.wall_mm / CM)!r}",
+        f"Collimator radius (cm): {_word(text.radius_mm / CM)}",
+        f"Wall thickness (cm): {_word(text.wall_mm / CM)}",
         f"Number of holes: {len(text.openings)}",
         f"nh / ind / {place} / y(cm) / z(cm) / shape / sizex(cm) / sizez(cm) / angx(deg) / "
         "angz(deg) / accx(deg) / accz(deg)",
@@ -216,10 +217,10 @@ class _Fields:
         return first
 
     def number(self, name: str, unit: str) -> float:
-        return _number(self.path, self.text(name, unit), name)
+        return number_in(self.path, self.text(name, unit), name)
 
     def whole(self, name: str) -> int:
-        value = _number(self.path, self.text(name), name)
+        value = number_in(self.path, self.text(name), name)
         if value != int(value) or not 1 <= value <= VIEWS:
             raise Refused(f"{self.path}: expected 1 to {VIEWS} for {name!r}, got {value:g}")
         return int(value)
@@ -239,8 +240,8 @@ def _opening(path: Path, line: str, model: str) -> Opening:
             f"{path}: expected {WIDTH} values of a hole (detector, place, round or rect, sizes, "
             f"angles), got {shown(line.strip())}"
         )
-    detector, *place = (_number(path, word, "a hole") for word in words[:4])
-    *size, tilt_x, tilt_z, accept_x, accept_z = (_number(path, w, "a hole") for w in words[5:])
+    detector, *place = (number_in(path, word, "a hole") for word in words[:4])
+    *size, tilt_x, tilt_z, accept_x, accept_z = (number_in(path, w, "a hole") for w in words[5:])
     if detector != int(detector) or not 1 <= detector <= VIEWS or min(size) <= 0:
         raise Refused(
             f"{path}: expected a detector from 1 on and positive sizes, got {shown(line.strip())}"
@@ -254,10 +255,3 @@ def _opening(path: Path, line: str, model: str) -> Opening:
         axis_degrees=(tilt_x, tilt_z),
         acceptance_degrees=(accept_x, accept_z),
     )
-
-
-def _number(path: Path, word: str, what: str) -> float:
-    try:
-        return number(word, what)
-    except ValueError as error:
-        raise Refused(f"{path}: {error}") from error

@@ -22,7 +22,7 @@ from mvrecon_spect.methods.corrections import (
     uniformity_factors,
 )
 
-#: Relative difference of two durations, above that by rounding.
+#: Greatest relative difference between equal durations, for rounding.
 MAX_DURATION_DIFFERENCE = 1e-3
 #: Most photons per decay in one energy window: two of an annihilation, and some margin.
 MAX_PHOTONS = 4

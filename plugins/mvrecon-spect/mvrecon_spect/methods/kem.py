@@ -99,7 +99,7 @@ def by_rows(K: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
 
 
 def _resampled(path: str | Path, grid: Grid) -> Float[Tensor, "d h w"]:
-    """The values of a file above its least one on a grid; beyond the file they are that, as air."""
+    """The values of a file less their minimum on a grid; zero, as of air, outside the file."""
     values, source = read_volume(path)
     return resample(values - values.min(), source, grid)
 

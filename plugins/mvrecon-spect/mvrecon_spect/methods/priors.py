@@ -6,7 +6,7 @@ difference, psi is approximately (a - b)^2 / (2 level), so a weight has a simila
 priors.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -110,18 +110,6 @@ def log_cosh(level: Float[Tensor, "b c 1 1 1"] | float, delta: float = 0.1) -> P
     return Potential(cost, slopes, lambda x: x / level)
 
 
-class Pairs(NamedTuple):
-    """All pairs of voxels with the same offset.
-
-    Args:
-        offset: step from the first voxel to the second, along (z, y, x).
-        weight: weight of each pair.
-    """
-
-    offset: Sequence[int]
-    weight: Float[Tensor, "d h w"]
-
-
 class Prior:
     """R = sum w psi(a, b) over pairs of 26-neighbours, in the unit of the volume; w is the inverse
     of their distance in units of the smallest voxel size.
@@ -152,41 +140,41 @@ class Prior:
         if not 1 <= similar <= 26:
             raise ValueError(f"Expected 1 to 26 similar neighbours, got {similar}")
         self.potential, pairs = potential, []
-        reach = None if anatomy is None else _reach(_checked(anatomy, mask), similar)
+        guide = None if anatomy is None else (anatomy, _reach(anatomy, mask, similar))
         for offset in HALF:
             if any(abs(o) >= n for o, n in zip(offset, mask.shape, strict=True)):
                 continue
             distance = sum((o * s / min(steps)) ** 2 for o, s in zip(offset, steps, strict=True))
             one, other = ends(mask, offset)
             weight = (one & other).to(torch.float32) / distance**0.5
-            if reach is not None and anatomy is not None:
-                weight = weight * _chosen(anatomy, reach, offset)
-            pairs.append(Pairs(offset, weight))
+            if guide is not None:
+                weight = weight * _chosen(*guide, offset)
+            pairs.append((offset, weight))
         # one GPU synchronisation
-        some = torch.stack([mask.any(), *(pair.weight.any() for pair in pairs)]).tolist()[1:]
+        some = torch.stack([mask.any(), *(weight.any() for _, weight in pairs)]).tolist()[1:]
+        #: The offset (z, y, x) of pairs of voxels, and the weights of all pairs with this offset.
         self.pairs = [pair for pair, any_of_it in zip(pairs, some, strict=True) if any_of_it]
         #: The sum of the weights of each voxel's pairs.
         self.weights = torch.zeros(1, 1, *mask.shape, dtype=torch.float64, device=mask.device)
-        for pair in self.pairs:
-            for end in ends(self.weights, pair.offset):
-                end.add_(pair.weight)
+        for offset, weight in self.pairs:
+            for end in ends(self.weights, offset):
+                end.add_(weight)
 
     def __call__(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, " b"]:
         """R of each case in float64, in the unit of the volume; differentiable."""
         total = volume.new_zeros(len(volume), dtype=torch.float64)
-        for weight, one, other in self._ends(volume):
-            cost = weight * self.potential.cost(one, other)
+        for offset, weight in self.pairs:
+            cost = weight.to(volume) * self.potential.cost(*ends(volume, offset))
             total = total + cost.flatten(1).sum(dim=1, dtype=torch.float64)
         return total
 
     def gradient(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c d h w"]:
         """Derivative of R with respect to each voxel, dimensionless; zero for equal neighbours."""
         slope = torch.zeros_like(volume)
-        parts = zip(self.pairs, self._ends(volume), strict=True)
-        for pair, (weight, one, other) in parts:
-            slopes = self.potential.slopes(one, other)
-            for end, by in zip(ends(slope, pair.offset), slopes, strict=True):
-                end.addcmul_(weight, by)
+        for offset, weight in self.pairs:
+            slopes = self.potential.slopes(*ends(volume, offset))
+            for end, by in zip(ends(slope, offset), slopes, strict=True):
+                end.addcmul_(weight.to(volume), by)
         return slope
 
     def bound(self, volume: Float[Tensor, "b c d h w"]) -> Float[Tensor, "#b #c d h w"]:
@@ -194,10 +182,6 @@ class Prior:
         dimensionless.
         """
         return 2 * self.weights.to(volume) * self.potential.growth(volume)
-
-    def _ends(self, volume: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        for pair in self.pairs:
-            yield (pair.weight.to(volume), *ends(volume, pair.offset))
 
 
 def prior_of(
@@ -242,20 +226,18 @@ def ends(volume: Tensor, offset: Sequence[int]) -> tuple[Tensor, Tensor]:
     return one, other
 
 
-def _checked(anatomy: Tensor, mask: Tensor) -> Tensor:
+def _reach(
+    anatomy: Float[Tensor, "d h w"], mask: Bool[Tensor, "d h w"], similar: int
+) -> Float[Tensor, "d h w"]:
+    """Largest anatomical difference between each voxel and its selected neighbours, in the
+    anatomy's unit.
+    """
     if anatomy.shape != mask.shape or not anatomy.isfinite().all():
         bad = int((~anatomy.isfinite()).sum())
         raise ValueError(
             f"Expected a finite anatomy of shape {tuple(mask.shape)}, got {tuple(anatomy.shape)} "
             f"with {bad} values that are not finite"
         )
-    return anatomy
-
-
-def _reach(anatomy: Float[Tensor, "d h w"], similar: int) -> Float[Tensor, "d h w"]:
-    """Largest anatomical difference between each voxel and its selected neighbours, in the
-    anatomy's unit.
-    """
     apart = anatomy.new_full((26, *anatomy.shape), torch.inf)
     for n, offset in enumerate(HALF):
         one, other = ends(anatomy, offset)

@@ -46,11 +46,10 @@ def tv_map(
             voxels, so f(a y) = a f(y): longer measurements are not smoothed more. 1e-3 to 1 is
             usual.
         balance: ratio of dual to primal steps; affects the speed only.
-        background: expected counts of other origin, one number or views that broadcast to the
-            counts.
+        background: expected background counts, a number or views that broadcast to the counts.
         common: start, support, monitor: see `Common`. The start is uniform by default. A monitor
-            also gets the objective (infinite while the iterate makes counts impossible), and costs
-            one projection an iteration.
+            also receives the objective (infinite while the iterate makes counts impossible), which
+            costs one projection per iteration.
 
     Raises:
         ValueError: as `mlem`; a negative weight, or a balance that is not positive.

@@ -80,12 +80,13 @@ def ball_means(
     Raises:
         ValueError: a volume whose shape is not that of the grid, or a ball outside the grid.
     """
-    _fits(volume, grid)
+    if tuple(volume.shape) != grid.shape:
+        raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")
     means = []
     radii = torch.full((1, 3), diameter / 2, dtype=torch.float64)
     half = diameter / 2 * torch.linalg.inv(grid.affine[:3, :3]).norm(dim=1)
     for centre in centres.double():
-        ball = Solids("ellipsoid", centre[None], torch.eye(3)[None], radii, torch.ones(1))
+        ball = Solids.upright("ellipsoid", centre[None], radii, torch.ones(1))
         share = voxelise(Phantom((ball,)), grid).double()
         apart = (grid.to_index(centre) - grid.centre_index).abs()
         if not (apart + half <= torch.tensor(grid.size) / 2).all():
@@ -148,8 +149,3 @@ def _values(volume: Tensor, mask: Tensor) -> Float[Tensor, " n"]:
             f"{mask.dtype} {tuple(mask.shape)} with {count}"
         )
     return volume[mask].double()
-
-
-def _fits(volume: Tensor, grid: Grid) -> None:
-    if tuple(volume.shape) != grid.shape:
-        raise ValueError(f"Expected a volume of shape {grid.shape}, got {tuple(volume.shape)}")

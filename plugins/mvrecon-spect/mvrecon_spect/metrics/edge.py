@@ -159,9 +159,11 @@ class Ball(NamedTuple):
 
 
 def balls(volume: Float[Tensor, "d h w"], grid: Grid) -> list[Ball]:
-    """The hot balls of a volume that `ball_mtf` takes, from the largest: face-connected parts above
-    the mean of the median and the 99.9th percentile, of at least eight voxels across, whose extents
-    along the voxels differ from the diameter of their volume by at most a fifth.
+    """The hot balls of a volume that `ball_mtf` can measure, the largest first.
+
+    A ball is a face-connected part above the mean of the median and the 99.9th percentile, at least
+    eight voxels across, whose extents along the voxels differ by at most a fifth from the diameter
+    of a ball of its volume.
     """
     values = volume.flatten()[:: 1 + volume.numel() // 2**22].double()
     limits = values.quantile(values.new_tensor([0.5, 0.999]))

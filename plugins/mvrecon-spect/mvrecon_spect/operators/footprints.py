@@ -15,6 +15,7 @@ contribute nothing.
 import math
 from collections.abc import Iterator, Sequence
 from copy import copy
+from types import SimpleNamespace
 
 import torch
 from jaxtyping import Bool, Float
@@ -167,7 +168,7 @@ class Footprints(FixedGeometry):
 
     def _kernels(self, tensor: Tensor):
         self.last_backend = choose_backend(tensor, self.backend, "footprints", self_test)
-        return reference_ops if self.last_backend == "reference" else ops
+        return REFERENCE if self.last_backend == "reference" else ops
 
     def _passes(self) -> Iterator[tuple[slice, Float[Tensor, "m d h w"] | None]]:
         """Slices of the cameras, with the transmission from each voxel to each pinhole: all at once
@@ -268,13 +269,10 @@ class Footprints(FixedGeometry):
         return PixelIntegral(self.hole.weight(self.cameras), rays)
 
 
-class _Reference:
-    """The operators by the reference."""
-
-    project, backproject = ops.FOOTPRINTS.apply, ops.FOOTPRINTS.apply_transpose
-
-
-reference_ops = _Reference()
+#: The operators by the reference.
+REFERENCE = SimpleNamespace(
+    project=ops.FOOTPRINTS.apply, backproject=ops.FOOTPRINTS.apply_transpose
+)
 
 
 def self_test(device: str, dtype: torch.dtype, purpose: str) -> Errors:

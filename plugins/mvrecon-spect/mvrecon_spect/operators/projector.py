@@ -218,11 +218,10 @@ def check_pinholes(cameras: Cameras, grid: Grid) -> None:
     place = cameras.source.detach() - grid.centre.to(cameras.source)
     voxels = place @ torch.linalg.inv(grid.affine[:3, :3]).to(place).T
     place = (voxels / (voxels.new_tensor(grid.size) / 2)).norm(dim=1)
-    if (place < OBJECT).any():
-        first = int((place < 1).nonzero()[0, 0])
+    if (inside := (place < OBJECT).nonzero()[:, 0]).numel():
         raise ValueError(
-            f"Expected pinholes outside of the grid, got pinhole {first} in it, in the "
-            "object; make the grid smaller, or look at mm and cm of camera and grid"
+            f"Expected pinholes outside of the grid, got pinhole {int(inside[0])} in it, in the "
+            f"object; make the grid smaller, or look at mm and cm of camera and grid"
         )
     averted = cameras.depth_range(grid)[:, 0].detach() >= 0
     if averted.any():

@@ -135,43 +135,29 @@ class Heart:
     def solids(self, uptake: Uptake) -> tuple[Solids, ...]:
         """Half-ellipsoids in heart axes: walls, cavities, and the defect in the left wall."""
         wall, right, blood, around = uptake
-        left = [_ellipsoid(self.radius - t, self.length - t) for t in (0.0, self.wall)]
         base = torch.tensor([[0.0, 0, -1, 0]], dtype=torch.float64)
-        values = left[0].new_tensor([wall - around, blood - wall])
-        whole = _half(left, values, base)
+        left = base.new_tensor([self.radius, self.radius, self.length]), self.wall
+        whole = _shell(*left, (wall - around, blood - wall), base)
         lost = self.defect.contrast * wall
-        scar = _half(left, values.new_tensor([-lost, lost]), self._defect())
-        beside = torch.cat([base, base.new_tensor([[-1.0, 0, 0, -self.radius]])])
+        scar = _shell(*left, (-lost, lost), self.defect.half_spaces(self.length))
         size = base.new_tensor([self.right_width, self.radius, 0.8 * self.length])
-        outer = [size, size - self.right_wall]
-        crescent = _half(outer, values.new_tensor([right - around, blood - right]), beside)
-        crescent = _shifted(crescent, self.radius)
+        beside = torch.cat([base, base.new_tensor([[-1.0, 0, 0, -self.radius]])])
+        levels = right - around, blood - right
+        crescent = _shell(size, self.right_wall, levels, beside, self.radius)
         return (whole, crescent) if lost == 0 else (whole, scar, crescent)
 
-    def _defect(self) -> Float[Tensor, "4 4"]:
-        return self.defect.half_spaces(self.length)
 
-
-def _ellipsoid(radius: float, length: float) -> Float[Tensor, "3"]:
-    return torch.tensor([radius, radius, length], dtype=torch.float64)
-
-
-def _half(
-    sizes: list[Float[Tensor, "3"]], values: Float[Tensor, " n"], cuts: Float[Tensor, "k 4"]
+def _shell(
+    size: Float[Tensor, "3"],
+    wall: float,
+    values: tuple[float, float],
+    cuts: Float[Tensor, "k 4"],
+    x: float = 0.0,
 ) -> Solids:
-    """Ellipsoids centred at the origin, cut by the same planes."""
-    n = len(sizes)
-    places, turns = torch.zeros(n, 3), torch.eye(3).expand(n, 3, 3)
-    return Solids("ellipsoid", places, turns, torch.stack(sizes), values, cuts.expand(n, -1, -1))
-
-
-def _shifted(solids: Solids, x: float) -> Solids:
-    """Ellipsoids shifted along x, with fixed cutting planes."""
-    moved = torch.zeros(len(solids.values), 3, dtype=torch.float64)
-    moved[:, 0] = x
-    return Solids(
-        solids.kind, moved, solids.rotations, solids.semi_axes, solids.values, solids.cuts
-    )
+    """An ellipsoid centred at x and a cavity in it, cut by the same planes."""
+    centre, sizes = size.new_tensor([[x, 0, 0]]), torch.stack([size, size - wall])
+    both = centre.expand(2, 3), sizes, size.new_tensor(values), cuts.expand(2, -1, -1)
+    return Solids.upright("ellipsoid", *both)
 
 
 class Patient(NamedTuple):
@@ -312,8 +298,7 @@ def _one(
 ) -> Solids:
     place, size = (grow * torch.tensor([list(v)], dtype=torch.float64) for v in (centre, semi_axes))
     half_spaces = None if cuts is None else torch.tensor([cuts], dtype=torch.float64)
-    turn = torch.eye(3, dtype=torch.float64)[None]
-    return Solids(kind, place, turn, size, place.new_tensor([value]), half_spaces)
+    return Solids.upright(kind, place, size, place.new_tensor([value]), half_spaces)
 
 
 def _check_room(grid: Grid) -> None:

@@ -12,44 +12,6 @@ from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import Grid
 
 
-def defrise(
-    discs: int = 7,
-    radius: float = 60.0,
-    thickness: float = 8.0,
-    pitch: float = 16.0,
-    centre: Sequence[float] = (0.0, 0.0, 0.0),
-    value: float = 1.0,
-) -> Phantom:
-    """The Defrise phantom, a stack of equal discs along z: a test of cone-beam and pinhole
-    artefacts along the axis.
-
-    Kudo and Saito, J. Opt. Soc. Am. A 7 (1990) 2169, and Defrise and Clack, IEEE Trans. Med.
-    Imaging 13 (1994) 186: circular orbits do not determine planes that no camera views edge-on.
-
-    Args:
-        discs: number of discs.
-        radius: radius of the discs in mm.
-        thickness: thickness of the discs in mm.
-        pitch: distance between adjacent discs in mm, at least the thickness.
-        centre: centre of the stack in world mm.
-        value: value in the discs.
-
-    Raises:
-        ValueError: no discs, non-positive sizes, or discs that overlap.
-    """
-    if not (discs >= 1 and radius > 0 and 0 < thickness <= pitch):
-        raise ValueError(
-            f"Expected one disc or more, of positive radius and thickness, at a pitch of at least "
-            f"the thickness, got {discs} discs, {radius}, {thickness} and {pitch} mm"
-        )
-    places = torch.zeros(discs, 3, dtype=torch.float64)
-    places[:, 2] = (torch.arange(discs) - (discs - 1) / 2) * pitch
-    places += torch.tensor(list(centre), dtype=torch.float64)
-    sizes = places.new_tensor([radius, radius, thickness / 2]).expand(discs, 3)
-    turns = torch.eye(3).expand(discs, 3, 3)
-    return Phantom((Solids("cylinder", places, turns, sizes, places.new_full((discs,), value)),))
-
-
 @dataclass(frozen=True, kw_only=True)
 class OneCase(AnalyticScene):
     """A deterministic scene of one case, centred on the grid."""
@@ -73,16 +35,20 @@ class OneCase(AnalyticScene):
 
 @dataclass(frozen=True, kw_only=True)
 class Defrise(OneCase):
-    """One case: a stack of discs along z, centred on the grid.
+    """One case: a stack of equal discs along z, centred on the grid, a test of cone-beam and
+    pinhole artefacts along the axis.
+
+    Kudo and Saito, J. Opt. Soc. Am. A 7 (1990) 2169, and Defrise and Clack, IEEE Trans. Med.
+    Imaging 13 (1994) 186: circular orbits do not determine planes that no camera views edge-on.
 
     Args:
         discs: number of discs.
         radius_mm: radius of the discs.
         thickness_mm: thickness of the discs.
-        pitch_mm: distance between adjacent discs.
+        pitch_mm: distance between adjacent discs, at least the thickness.
 
     Raises:
-        ValueError: see `defrise`.
+        ValueError: no discs, sizes that are not positive, or discs that overlap.
     """
 
     discs: PositiveInt = 7
@@ -93,5 +59,15 @@ class Defrise(OneCase):
 
     def about(self, centre: Sequence[float]) -> Phantom:
         """The stack of discs centred at a point in world mm."""
-        sizes = self.discs, self.radius_mm, self.thickness_mm, self.pitch_mm
-        return defrise(*sizes, centre, self.value)
+        discs, radius = self.discs, self.radius_mm
+        thickness, pitch = self.thickness_mm, self.pitch_mm
+        if not (discs >= 1 and radius > 0 and 0 < thickness <= pitch):
+            raise ValueError(
+                f"Expected one disc or more, of positive radius and thickness, at a pitch of at "
+                f"least the thickness, got {discs} discs, {radius}, {thickness} and {pitch} mm"
+            )
+        places = torch.tensor([list(centre)], dtype=torch.float64).repeat(discs, 1)
+        places[:, 2] += (torch.arange(discs) - (discs - 1) / 2) * pitch
+        sizes = places.new_tensor([radius, radius, thickness / 2]).expand(discs, 3)
+        values = places.new_full((discs,), self.value)
+        return Phantom((Solids.upright("cylinder", places, sizes, values),))

@@ -49,14 +49,10 @@ def ventricle(
         raise ValueError(
             f"A ventricle's blood must be a fraction in [0, 1) of the value, got {blood}"
         )
-    surfaces, values = (
-        torch.stack([outer, outer - wall]),
-        outer.new_tensor([value, -value * (1 - blood)]),
-    )
-    shell = Phantom(
-        (Solids("ellipsoid", torch.zeros(2, 3), torch.eye(3).expand(2, 3, 3), surfaces, values),)
-    )
-    return shell.moved(
+    surfaces = torch.stack([outer, outer - wall])
+    values = outer.new_tensor([value, -value * (1 - blood)])
+    shell = Solids.upright("ellipsoid", torch.zeros(2, 3), surfaces, values)
+    return Phantom((shell,)).moved(
         euler_rotation(euler_degrees), torch.tensor(list(centre), dtype=torch.float64)
     )
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mvrecon.methods.learned.view_frames import Frusta, fuse
 from mvrecon.testing import check_head
-from mvrecon.testing.measures import gap, greatest
+from mvrecon.testing.measures import gap
 from mvrecon_bench.stresses.case import PRECISE, case, none_of
 from mvrecon_bench.stresses.subject import Subject
 from mvrecon_bench.stresses.subjects import GRID, HeadSubject, small_rig
@@ -80,29 +80,27 @@ def at_the_ends(subject: HeadSubject) -> float:
 
 
 @case("head", 53, PRECISE)
-def views_kept(subject: HeadSubject) -> float:
+def views_kept(subject: HeadSubject) -> Iterator[float]:
     """Re-projection of extreme inputs: matches the views if claimed; zero from zero."""
-    errors = [0.0]
+    yield 0.0
     for _, (logits, prior, views) in extremes(subject):
         density = subject.head(logits, prior, views, subject.frusta)
         if subject.head.keeps_views:
-            errors.append(gap(subject.frusta.integrate(density), views))
+            yield gap(subject.frusta.integrate(density), views)
         elif not views.any() and not prior.any():
-            errors.append(float(density.abs().max()))
-    return greatest(errors)
+            yield float(density.abs().max())
 
 
 @case("mvrecon", 53, PRECISE)
-def fused_weights(subject: Subject) -> float:
+def fused_weights(subject: Subject) -> Iterator[float]:
     """Fusion by logits of any size: weights sum to one."""
     visible = subject.random(3, 1, 4, 5, 6) < 0.5
-    errors = []
     for size in (0.0, 1e4, -1e4, 1e30, -1e30):
         logits = torch.full((2, 3, 1, 4, 5, 6), size, dtype=subject.dtype, device=subject.device)
         volume, weights = fuse(subject.random(2, 3, 1, 4, 5, 6), logits, visible)
         expected = visible.to(subject.dtype) / visible.sum(dim=0).clamp_min(1)
-        errors += [float((weights - expected).abs().max()), float(volume.isnan().sum())]
-    return greatest(errors)
+        yield float((weights - expected).abs().max())
+        yield float(volume.isnan().sum())
 
 
 @case("head", 61)

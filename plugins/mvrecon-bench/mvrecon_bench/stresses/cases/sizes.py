@@ -5,6 +5,7 @@ in main memory and on a GPU.
 import math
 import mmap
 import tempfile
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -31,9 +32,8 @@ LONG, FEW = 46400, 8
 
 
 @case("projector", 18)
-def no_volumes(subject: ProjectorSubject) -> float:
+def no_volumes(subject: ProjectorSubject) -> Iterator[float]:
     """Empty batch, no channels: empty result of the right shape with a gradient, or an error."""
-    violations = 0.0
     for batch, channels in ((0, 1), (2, 0), (0, 0)):
         A, x, y = subject.pair(batch=batch, channels=channels)
         for act, operand, expected in ((A, x.requires_grad_(), y), (A.T, y.requires_grad_(), x)):
@@ -42,8 +42,7 @@ def no_volumes(subject: ProjectorSubject) -> float:
             except ValueError:
                 continue
             (gradient,) = torch.autograd.grad(out.sum(), operand)
-            violations += (out.shape != expected.shape) + (gradient.shape != operand.shape)
-    return violations
+            yield (out.shape != expected.shape) + (gradient.shape != operand.shape)
 
 
 @case("projector", 21, EXACT)
@@ -88,19 +87,17 @@ def large_detector(subject: ProjectorSubject) -> float:
 
 
 @case("projector", 28, EXACT)
-def subsets(subject: ProjectorSubject) -> float:
+def subsets(subject: ProjectorSubject) -> Iterator[float]:
     """Subsets of cameras and of pixels: add up to the operator."""
     A, x, y = subject.pair(channels=2, n_views=7)
     chosen, shape = torch.rand(A.range_shape) < 0.4, A.range_shape
-    errors = []
     for selections in (
         [ViewSelection(shape, [6, 0, 3]), ViewSelection(shape, [1, 2, 4, 5])],
         [RaySelection(shape, chosen), RaySelection(shape, ~chosen)],
     ):
         parts = [(S, A.subset(S)) for S in selections]
-        errors += [gap(torch.stack([S.T(B(x)) for S, B in parts]).sum(dim=0), A(x))]
-        errors += [gap(torch.stack([B.T(S(y)) for S, B in parts]).sum(dim=0), A.T(y))]
-    return greatest(errors)
+        yield gap(torch.stack([S.T(B(x)) for S, B in parts]).sum(dim=0), A(x))
+        yield gap(torch.stack([B.T(S(y)) for S, B in parts]).sum(dim=0), A.T(y))
 
 
 def need_gpu(subject: Subject, gigabytes: float) -> None:
@@ -168,9 +165,9 @@ def long_strides(subject: ProjectorSubject) -> float:
 
 
 @case("mvrecon", 46, 1e-11, DOUBLE)
-def last_voxels(subject: Subject) -> float:
+def last_voxels(subject: Subject) -> Iterator[float]:
     """The last of 2^31 voxels: equal to a small volume's."""
-    side, errors = 1300, []
+    side = 1300
     grid = Grid.centred((side, side, side), 1.0)
     box = Box((side - 5, side - 6, side - 7), (side, side, side))
     alone = grid.cropped(box)
@@ -186,23 +183,21 @@ def last_voxels(subject: Subject) -> float:
         rays = A.lines, A.ray_extent
         views = ops.project(x[0], *rays, A.detector, method, occupancy)
         volume = ops.backproject(views, *rays, list(box.shape), method, occupancy)
-        errors += [gap(views, B(x)[0]), gap(volume, B.T(views[None])[0])]
-    return greatest(errors)
+        yield gap(views, B(x)[0])
+        yield gap(volume, B.T(views[None])[0])
 
 
 @case("mvrecon", 46, 1e-6, SINGLE)
-def last_pixels(subject: Subject) -> float:
+def last_pixels(subject: Subject) -> Iterator[float]:
     """The last of 2^31 pixels: equal to a small detector's."""
     support = torch.zeros(GRID.shape, dtype=torch.bool)
     support[1:-1, 1:-1, 1:-1] = True
-    errors = []
     for name in ("drr", "radon"):
         rig = rig_about(GRID, name == "radon", detector=_long(), n_views=1)
         for method in ("joseph", "siddon", "trilinear"):
             options = {"method": method, "support": support}
             own = ProjectorSubject("projector", name, options, subject.device, subject.dtype)
-            errors.append(_last_pixels(own, rig))
-    return greatest(errors)
+            yield _last_pixels(own, rig)
 
 
 def _long() -> dict:

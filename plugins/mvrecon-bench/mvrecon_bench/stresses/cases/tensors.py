@@ -36,18 +36,16 @@ def layouts(values: Tensor) -> Iterator[Tensor]:
 
 
 @case("projector", 38, 0.0, EVERY)
-def memory(subject: ProjectorSubject) -> float:
+def memory(subject: ProjectorSubject) -> Iterator[float]:
     """Memory of any layout: bitwise equal to contiguous memory."""
-    violations = 0.0
     for act, operand in both(subject):
         expected, spread = act(operand), operand[:1, :1, :, :1].expand_as(operand)
-        violations += sum(bits(act(other), expected) for other in layouts(operand))
-        violations += bits(act(spread), act(spread.contiguous()))
-    return violations
+        yield sum(bits(act(other), expected) for other in layouts(operand))
+        yield bits(act(spread), act(spread.contiguous()))
 
 
 @case("mvrecon", 38, 0.0, DOUBLE)
-def backwards(_: Subject) -> float:
+def backwards(_: Subject) -> Iterator[float]:
     """Arrays with negative strides: an error, or equal to a copy."""
     points = np.arange(1.0, 7.0).reshape(2, 3) ** 2
     takes: list[tuple[Callable[[Any], Tensor], np.ndarray]] = [
@@ -58,19 +56,16 @@ def backwards(_: Subject) -> float:
             np.stack([points, points + 2.0])[:, None],
         ),
     ]
-    violations = 0.0
     for take, array in takes:
         try:
-            violations += bits(take(array[::-1]), take(array[::-1].copy()))
+            yield bits(take(array[::-1]), take(array[::-1].copy()))
         except (ValueError, TypeError):
             continue
-    return violations
 
 
 @case("projector", 39, 0.0, EVERY)
-def incoming(subject: ProjectorSubject) -> float:
+def incoming(subject: ProjectorSubject) -> Iterator[float]:
     """Gradients of any layout: bitwise equal to contiguous memory."""
-    violations = 0.0
     for act, operand in both(subject):
         out = act(operand.requires_grad_())
         whole = torch.rand(out.shape, dtype=torch.float64).to(out)
@@ -78,14 +73,12 @@ def incoming(subject: ProjectorSubject) -> float:
         for gradient in [*spread, *layouts(whole)]:
             plain = gradient.clone(memory_format=torch.contiguous_format)
             slopes = (torch.autograd.grad(act(operand), operand, g)[0] for g in (gradient, plain))
-            violations += bits(*slopes)
-    return violations
+            yield bits(*slopes)
 
 
 @case("projector", 40)
-def edited(subject: ProjectorSubject) -> float:
+def edited(subject: ProjectorSubject) -> Iterator[float]:
     """Edits between forward and backward: an error, or the correct gradient."""
-    violations = 0.0
     for act, operand in both(subject):
         expected = act(operand.requires_grad_())
         weight = torch.rand(expected.shape, dtype=torch.float64).to(expected)
@@ -93,12 +86,11 @@ def edited(subject: ProjectorSubject) -> float:
         out, kept = act(operand), operand.detach().clone()
         with torch.no_grad():
             operand.fill_(torch.nan)
-        violations += bits(out, expected) + _unless_refused(out, operand, weight, gradient)
+        yield bits(out, expected) + _unless_refused(out, operand, weight, gradient)
         with torch.no_grad():
             operand.copy_(kept)
         doubled = act(operand).mul_(2)
-        violations += _unless_refused(doubled, operand, weight, 2 * gradient) + bits(operand, kept)
-    return violations
+        yield _unless_refused(doubled, operand, weight, 2 * gradient) + bits(operand, kept)
 
 
 @case("projector", 40)
@@ -123,19 +115,17 @@ def _unless_refused(out: Tensor, operand: Tensor, weight: Tensor, expected: Tens
 
 
 @case("projector", 41, 0.0, SINGLE)
-def halves(subject: ProjectorSubject) -> float:
+def halves(subject: ProjectorSubject) -> Iterator[float]:
     """Half-precision volumes: bitwise equal to the same values in float32, with gradients in half
     precision.
     """
-    violations = 0.0
     for dtype in HALVES:
         for act, operand in both(subject):
             small = operand.to(dtype).requires_grad_()
             out, expected = act(small), act(small.detach().float())
             (slope,) = torch.autograd.grad(out.sum(), small)
-            violations += bits(out, expected) + (out.dtype != torch.float32)
-            violations += slope.dtype != dtype or not bool(slope.any())
-    return violations
+            yield bits(out, expected) + (out.dtype != torch.float32)
+            yield slope.dtype != dtype or not bool(slope.any())
 
 
 @case("projector", 41, 1.0, SINGLE)
@@ -149,9 +139,8 @@ def rounded(subject: ProjectorSubject) -> float:
 
 
 @case("projector", 41)
-def no_numbers(subject: ProjectorSubject) -> float:
+def no_numbers(subject: ProjectorSubject) -> Iterator[float]:
     """Integers, booleans, complex numbers, arrays: an error, or correct values of a plugin."""
-    violations = 0.0
     for act, operand in both(subject):
         ones = operand.round()
         real = ones.float()
@@ -162,27 +151,23 @@ def no_numbers(subject: ProjectorSubject) -> float:
                 continue
             ours = isinstance(getattr(act, "__self__", act), RayTransform)
             values = isinstance(other, Tensor) and not other.is_complex()
-            violations += ours or not values or bits(result, act(other.to(result.dtype))) > 0
-    return violations
+            yield ours or not values or bits(result, act(other.to(result.dtype))) > 0
 
 
 @case("projector", 41)
-def cast(subject: ProjectorSubject) -> float:
+def cast(subject: ProjectorSubject) -> Iterator[float]:
     """A module cast to half precision: geometry keeps its precision, in any dtype."""
-    violations = 0.0
     for dtype in EVERY:
         A, x, y = subject.pair(batch=2, channels=3)
         if not isinstance(A, torch.nn.Module):
             raise DoesNotApply("it is no torch.nn.Module")
         views, volume, B = A(x), A.T(y), A.to(dtype)  # type: ignore[operator]
-        violations += bits(B(x), views) + bits(B.T(y), volume)  # type: ignore[operator]
-    return violations
+        yield bits(B(x), views) + bits(B.T(y), volume)
 
 
 @case("mvrecon", 41, 0.0, DOUBLE)
-def half_geometry(_: Subject) -> float:
+def half_geometry(_: Subject) -> Iterator[float]:
     """Geometry in half precision: stored in float64 without further loss."""
-    violations = 0.0
     vectors = {"source": [0, 0, 9], "origin": [-1.5, 1, -7], "u": [1, 0, 0], "v": [0, -1, 0]}
     given: dict[str, Any]
     for dtype in (*HALVES, torch.float32):
@@ -192,14 +177,13 @@ def half_geometry(_: Subject) -> float:
         affine = torch.diag(torch.tensor([1.1, 0.7, 3.3, 1.0])).to(dtype)
         pairs = [(getattr(rig, name), given[name]) for name in VECTORS]
         pairs += [(rays.source[0, 0], given["source"]), (Grid((2, 3, 4), affine).affine, affine)]
-        violations += sum(a.dtype != torch.float64 or bits(a, b.double()) for a, b in pairs)
-    return violations
+        yield sum(a.dtype != torch.float64 or bits(a, b.double()) for a, b in pairs)
 
 
 @case("projector", 42)
-def autocast(subject: ProjectorSubject) -> float:
+def autocast(subject: ProjectorSubject) -> Iterator[float]:
     """Autocast: bitwise equal, same dtypes, also of derivatives."""
-    violations, device = 0.0, subject.device.partition(":")[0]
+    device = subject.device.partition(":")[0]
     for act, operand in both(subject):
         out = act(operand.requires_grad_())
         (gradient,) = torch.autograd.grad(out.square().sum(), operand)
@@ -207,5 +191,4 @@ def autocast(subject: ProjectorSubject) -> float:
             with torch.autocast(device, dtype):
                 result = act(operand)
                 (back,) = torch.autograd.grad(result.square().sum(), operand)
-            violations += (result.dtype != out.dtype) + bits(result, out) + bits(back, gradient)
-    return violations
+            yield (result.dtype != out.dtype) + bits(result, out) + bits(back, gradient)

@@ -30,30 +30,28 @@ def skips(A: Any) -> Iterator[None]:
 
 
 @case("projector", 19, 0.0, EVERY)
-def zeros(subject: ProjectorSubject) -> float:
+def zeros(subject: ProjectorSubject) -> Iterator[float]:
     """Volumes and views of zeros of either sign: exactly zero, and gradients are those of the
     adjoint.
     """
     A, one, rays = subject.pair()
-    violations = 0.0
     for zero in (0.0, -0.0):
         x = torch.full_like(one, zero).requires_grad_()
-        violations += float((A.T(torch.full_like(rays, zero)) != 0).sum())
+        yield float((A.T(torch.full_like(rays, zero)) != 0).sum())
         for _ in skips(A):
             (gradient,) = torch.autograd.grad((views := A(x)).sum(), x)
             expected = A.T(torch.ones_like(views)).to(x.dtype)
-            violations += float((views != 0).sum()) + (not gap(gradient, expected) <= 1e-5)
-    return violations
+            yield float((views != 0).sum()) + (not gap(gradient, expected) <= 1e-5)
 
 
 @case("projector", 47, 0.0, EVERY)
-def bad_voxels(subject: ProjectorSubject) -> float:
+def bad_voxels(subject: ProjectorSubject) -> Iterator[float]:
     """A voxel that is no number: exactly the rays that meet it are none, whether many, few or no
     rays do, among finite values or zeros.
     """
     subject.need("local")
     A, x, y = subject.pair(BRICKS, detector=NARROW)
-    met, violations = A.T(torch.ones_like(y)).flatten(), 0.0
+    met = A.T(torch.ones_like(y)).flatten()
     for voxel in (met.argmax(), torch.where(met > 0, met, torch.inf).argmin(), met.argmin()):
         chosen = torch.zeros_like(x).flatten().index_fill(0, voxel, 1).view_as(x)
         hits = A(chosen) != 0
@@ -61,22 +59,22 @@ def bad_voxels(subject: ProjectorSubject) -> float:
         assert bool(hits.any()) == bool(met[voxel] > 0), told
         for bad, background in itertools.product(NO_NUMBERS, (x, torch.zeros_like(x))):
             spoilt = torch.where(chosen > 0, bad, background)
-            violations += sum(float((A(spoilt).isfinite() == hits).sum()) for _ in skips(A))
-    return violations if float(met.min()) == 0 else torch.nan
+            yield sum(float((A(spoilt).isfinite() == hits).sum()) for _ in skips(A))
+    yield 0.0 if float(met.min()) == 0 else torch.nan
 
 
 @case("projector", 47)
-def bad_pixel(subject: ProjectorSubject) -> float:
+def bad_pixel(subject: ProjectorSubject) -> Iterator[float]:
     """A pixel that is no number: exactly the voxels on its ray are none."""
     subject.need("local")
     A, _, y = subject.pair(BRICKS)
-    one, violations = torch.zeros_like(y), 0.0
+    one = torch.zeros_like(y)
     one[..., 1, 2, 3] = 1
     met = A.T(one) != 0
     for bad, background in itertools.product(NO_NUMBERS, (y, torch.zeros_like(y))):
         spoilt = A.T(torch.where(one > 0, bad, background))
-        violations += float((spoilt.isfinite() == met).sum())
-    return violations if met.any() else torch.nan
+        yield float((spoilt.isfinite() == met).sum())
+    yield 0.0 if met.any() else torch.nan
 
 
 @case("projector", 47, 0.0, EVERY)
