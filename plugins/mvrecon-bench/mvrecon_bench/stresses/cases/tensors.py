@@ -161,7 +161,8 @@ def cast(subject: ProjectorSubject) -> Iterator[float]:
         A, x, y = subject.pair(batch=2, channels=3)
         if not isinstance(A, torch.nn.Module):
             raise DoesNotApply("it is no torch.nn.Module")
-        views, volume, B = A(x), A.T(y), A.to(dtype)  # type: ignore[operator]
+        views, volume = A(x), A.T(y)
+        B: Any = A.to(dtype)
         yield bits(B(x), views) + bits(B.T(y), volume)
 
 
