@@ -161,7 +161,7 @@ def cast(subject: ProjectorSubject) -> Iterator[float]:
         A, x, y = subject.pair(batch=2, channels=3)
         if not isinstance(A, torch.nn.Module):
             raise DoesNotApply("it is no torch.nn.Module")
-        views, volume = A(x), A.T(y)
+        views, volume = A(x), A.T(y)  # type: ignore[operator]
         B: Any = A.to(dtype)
         yield bits(B(x), views) + bits(B.T(y), volume)
 
