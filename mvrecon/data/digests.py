@@ -6,7 +6,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,13 +73,19 @@ def of_file(path: str | Path) -> str:
     return _of_bytes(path)
 
 
-def of_code(*parts: Any) -> dict[str, str]:
-    """Digests of the files of the modules or packages that define parts and their base classes, by
-    name: all files of a package; of a module outside of packages also the modules beside it that
-    are imported. A release of mvrecon is identified by its version, and a notebook has no file.
+def of_parts(*parts: Any) -> dict[str, str]:
+    """Digests of the code that defines parts and their base classes; see `of_code`."""
+    kinds = (kind for part in parts for kind in getattr(part, "__mro__", (part,)))
+    return of_code({kind.__module__ for kind in kinds})
+
+
+def of_code(modules: Iterable[str]) -> dict[str, str]:
+    """Digests of the files of imported modules, or of the packages that they are in, by name: all
+    files of a package; of a module outside of packages also the modules beside it that are
+    imported. A release of mvrecon is identified by its version, and a notebook has no file.
     """
     found = {}
-    for name in {kind.__module__ for part in parts for kind in getattr(part, "__mro__", (part,))}:
+    for name in modules:
         top = name.partition(".")[0]
         if top in LIBRARIES:
             continue

@@ -287,7 +287,7 @@ class SceneData(L.LightningDataModule):
             makers = [REGISTRIES[kind].get(node["name"]) for _, kind, node in parts]
             made_of = {
                 "version": __version__,
-                "code": sha256.of_code(type(scene), *makers),
+                "code": sha256.of_parts(type(scene), *makers),
                 **settings,
                 "files": {path: digests[path] for path in self._files[key]},
                 "fine": self.acquisition.fine,

@@ -1,6 +1,9 @@
 """A training resumes with the settings that it began with, from a checkpoint that holds all."""
 
+import importlib
 import shutil
+import sys
+import warnings
 
 import pytest
 import yaml
@@ -94,3 +97,38 @@ def test_a_checkpoint_that_lacks_what_a_training_resumes_from_is_refused(key, st
     said = capsys.readouterr().err
     assert f"{last}: expected a training to resume, got one without ['{key}']" in said
     assert contents(folder) == before
+
+
+def test_a_run_that_is_continued_with_other_versions_or_code_says_so(tmp_path, monkeypatch):
+    """Of mvrecon and torch, of an installed plugin, and of an edited module of `plugins`; not with
+    the same ones, on another platform, or of what an earlier version did not note.
+    """
+    folder, settings = tmp_path / "run", {"plugins": ["edited_of_a_run"]}
+    monkeypatch.syspath_prepend(str(tmp_path))
+    code = tmp_path / "edited_of_a_run.py"
+    code.write_text("import mvrecon\n")
+    importlib.import_module("edited_of_a_run")
+
+    def said():
+        with warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter("always")
+            with run_folder.run_lock(folder, settings):
+                pass
+        return " ".join(str(one.message) for one in given)
+
+    assert said() == said() == ""
+    path = folder / "versions.txt"
+    noted = dict(line.split(" ", 1) for line in path.read_text().splitlines())
+    assert noted["edited_of_a_run"].startswith("sha256:")
+    for name in ("mvrecon", "torch", "mvrecon-spect", "platform", "numpy"):
+        noted[name] = "0.1"
+    del noted["numpy"]
+    path.write_text("".join(f"{name} {version}\n" for name, version in noted.items()))
+    now = run_folder.versions()
+    text = said()
+    for name in ("mvrecon", "torch", *({"mvrecon-spect"} & set(now))):
+        assert f"{name} 0.1 became {now[name]}" in text
+    assert "platform" not in text and "numpy" not in text and said() == ""
+    code.write_text("import mvrecon  # edited\n")
+    assert f"edited_of_a_run {noted['edited_of_a_run']} became sha256:" in said()
+    monkeypatch.delitem(sys.modules, "edited_of_a_run")
