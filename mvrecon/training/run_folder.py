@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from mvrecon import __version__
+from mvrecon.core import registry
 from mvrecon.core.files.atomic import claimed, written_whole
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
-from mvrecon.core import registry
 from mvrecon.data import digests
 from mvrecon.geometry.cameras import files
 from mvrecon.training.settings import TrainSettings
