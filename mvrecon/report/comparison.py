@@ -257,8 +257,9 @@ def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
     """Positions of the scenes that two methods have in common.
 
     None are where the figures are of different data ranges: twice the range alone is 6 dB. Scenes
-    of one table, or of two with the same test scenes, are in the same order. Others are recognised by their names and, on the same grid, by their true volumes, else by equal settings
-    of the scenes where both tables have some: patients of two sites may have one name.
+    of one table, or of two with the same test scenes, are in the same order. Others are recognised
+    by their names and, on the same grid, by their true volumes, else by equal settings of the
+    scenes where both tables have some: patients of two sites may have one name.
 
     Raises:
         Refused: several scenes of one name, which a table of an earlier version does not tell
