@@ -6,7 +6,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ SIGNIFICANT_DECIMALS = 9
 #: line with a NUL, which is none of text.
 HEADER = 2**16
 STATED = re.compile(r"^[^=:\n\0]*[=:]=?[ \t]*([^\s\0][^\n\0]*?)\s*$", re.MULTILINE)
+
+#: Top packages whose code `of_code` leaves out.
+LIBRARIES = {"mvrecon", "torch", *sys.stdlib_module_names} - {"__main__"}
 
 
 def of_rig(cameras: Cameras) -> str:
@@ -70,22 +73,47 @@ def of_file(path: str | Path) -> str:
     return _of_bytes(path)
 
 
-def of_code(*parts: Any) -> dict[str, str]:
-    """Digests of the Python files of the modules or packages that define parts, by name; a release
-    of mvrecon is identified by its version, and a notebook has no file.
+def of_parts(*parts: Any) -> dict[str, str]:
+    """Digests of the code that defines parts and their base classes; see `of_code`."""
+    kinds = (kind for part in parts for kind in getattr(part, "__mro__", (part,)))
+    return of_code({kind.__module__ for kind in kinds})
+
+
+def of_code(modules: Iterable[str]) -> dict[str, str]:
+    """Digests of the files of imported modules, or of the packages that they are in, by name: all
+    files of a package; of a module outside of packages also the modules beside it that are
+    imported. A release of mvrecon is identified by its version, and a notebook has no file.
     """
     found = {}
-    modules = {part.__module__ for part in parts}
-    packages = {name.partition(".")[0] for name in modules}  # namespace packages have no file
-    for name in sorted(modules | packages):
-        if name.partition(".")[0] == "mvrecon":
+    for name in modules:
+        top = name.partition(".")[0]
+        if top in LIBRARIES:
             continue
-        if place := getattr(sys.modules.get(name), "__file__", None):
-            path = Path(place)
-            files = sorted(path.parent.rglob("*.py")) if path.stem == "__init__" else [path]
-            whole = json.dumps([_of_bytes(file) for file in files])
+        name = top if _place(top) else name  # namespace packages have no file
+        if path := _place(name):
+            whole = json.dumps([_of_bytes(file) for file in sorted(_code(path))])
             found[name] = hashlib.sha256(whole.encode()).hexdigest()
     return found
+
+
+def _place(module: str) -> Path | None:
+    """The file of an imported module, if it has one."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    return file and Path(file)
+
+
+def _code(path: Path) -> set[Path]:
+    """The files of a module or, by its __init__.py, of a package; no hidden or compiled ones."""
+    if path.stem != "__init__":
+        modules = [getattr(module, "__dict__", {}) for module in [*sys.modules.values()]]
+        loaded = {names.get("__file__") for names in modules}
+        return {path, *(file for file in path.parent.glob("*.py") if str(file) in loaded)}
+    below = {file: file.relative_to(path.parent).parts for file in path.parent.rglob("*")}
+    return {
+        file
+        for file, parts in below.items()
+        if file.is_file() and not any(part.startswith((".", "__pycache__")) for part in parts)
+    }
 
 
 def _of_bytes(path: Path) -> str:
@@ -113,20 +141,25 @@ def _stated_in(path: Path) -> list[Path]:
     return [place for place in places if os.path.isfile(place) and place != path]
 
 
-def files_in(settings: Any) -> Iterator[str]:
-    """The files and folders that a part's settings name: every existing `path`, and existing files
-    of any other option, such as an attenuation map.
+def files_in(settings: Any, key: str = "") -> Iterator[str]:
+    """The files and folders that a part's settings name: existing files of any option, such as an
+    attenuation map, or of a list; existing folders of an option `path`, or by an absolute path.
+
+    Args:
+        settings: settings, or the value of one.
+        key: name of the option whose value it is.
     """
     if isinstance(settings, Mapping):
-        for key, value in settings.items():
-            if isinstance(value, str | os.PathLike) and (
-                os.path.isfile(value) or (key == "path" and os.path.isdir(value))
-            ):
-                yield os.fspath(value)
-        settings = list(settings.values())
-    if isinstance(settings, list | tuple):
+        for name, value in settings.items():
+            yield from files_in(value, name)
+    elif isinstance(settings, list | tuple):
         for item in settings:
-            yield from files_in(item)
+            yield from files_in(item, key)
+    elif isinstance(settings, str | os.PathLike) and (
+        os.path.isfile(settings)
+        or ((key == "path" or os.path.isabs(settings)) and os.path.isdir(settings))
+    ):
+        yield os.fspath(settings)
 
 
 def compare(got: Mapping[str, str], expected: Mapping[str, str], where: str | Path) -> None:

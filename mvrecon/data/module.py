@@ -16,7 +16,8 @@ from torch.utils.data import DataLoader
 
 from mvrecon import __version__
 from mvrecon.core.numbers import data_range_of
-from mvrecon.core.parts import CAMERAS, PROJECTORS, SCENES, ScenePart
+from mvrecon.core.options import parts_in
+from mvrecon.core.parts import CAMERAS, REGISTRIES, SCENES, ProjectorPart, ScenePart
 from mvrecon.core.quantities import NonNegativeInt, PositiveInt
 from mvrecon.core.registry import from_options
 from mvrecon.data import dataset, digests as sha256
@@ -279,16 +280,16 @@ class SceneData(L.LightningDataModule):
         scene, store = self.scenes[key], None
         if self.loading.cache is not None:
             digests = self.digests(key)
+            settings = {"scene": self._settings[key], "projector": self.projector}
+            parts = parts_in(settings["scene"], ScenePart)
+            parts += parts_in(self.projector or {}, ProjectorPart)
             # a factory may be of a plugin, and what it builds of mvrecon
-            parts: list[Any] = [type(scene), SCENES.get(self._settings[key]["name"])]
-            if self.projector is not None:
-                parts.append(PROJECTORS.get(self.projector["name"]))
+            makers = [REGISTRIES[kind].get(node["name"]) for _, kind, node in parts]
             made_of = {
                 "version": __version__,
-                "code": sha256.of_code(*parts),
-                "scene": self._settings[key],
+                "code": sha256.of_parts(type(scene), *makers),
+                **settings,
                 "files": {path: digests[path] for path in self._files[key]},
-                "projector": self.projector,
                 "fine": self.acquisition.fine,
                 "rays": self.acquisition.rays,
                 "closed_form": self.acquisition.closed_form,

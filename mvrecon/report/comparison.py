@@ -43,6 +43,7 @@ class Row:
         scenes: names of the test scenes, a patient each.
         truths: mean and root mean square of each true volume; empty in tables of earlier versions.
         measured: settings of the test scenes and the grid.
+        data_range: range of the true values, of which PSNR and SSIM are; nan: unknown.
         figures: figures of merit by name, a value for each scene; nan for a failed volume.
         failed: number of scenes whose volume holds NaN or infinity.
         ms: milliseconds of one reconstruction.
@@ -57,6 +58,7 @@ class Row:
     scenes: tuple[str, ...]
     truths: tuple[tuple[float, ...], ...]
     measured: Mapping[str, Any]
+    data_range: float
     figures: Mapping[str, tuple[float, ...]]
     failed: int
     ms: float
@@ -114,6 +116,7 @@ def rows_of(table: Results, run: str, folder: Path) -> Iterator[Row]:
             scenes=tuple(map(str, table["scenes"])),
             truths=truths,
             measured={"grid": table.get("grid"), **measured},
+            data_range=_number(table.get("data_range")),
             figures=figures,
             failed=sum(map(math.isnan, figures["ssim"])),  # a finite volume always has an SSIM
             ms=_number(row["ms_per_volume"]),
@@ -253,9 +256,10 @@ def difference(row: Row, reference: Row, metric: str) -> Interval:
 def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
     """Positions of the scenes that two methods have in common.
 
-    Scenes of one table, or of two with the same test scenes, are in the same order. Others are
-    recognised by their names and, on the same grid, by their true volumes, else by equal settings
-    of the scenes where both tables have some: patients of two sites may have one name.
+    None are where the figures are of different data ranges: twice the range alone is 6 dB. Scenes
+    of one table, or of two with the same test scenes, are in the same order. Others are recognised
+    by their names and, on the same grid, by their true volumes, else by equal settings of the
+    scenes where both tables have some: patients of two sites may have one name.
 
     Raises:
         Refused: several scenes of one name, which a table of an earlier version does not tell
@@ -263,6 +267,9 @@ def common_scenes(row: Row, reference: Row) -> list[tuple[int, int]]:
     """
     if row.folder == reference.folder:
         return [(k, k) for k in range(len(row.scenes))]
+    ranges = row.data_range, reference.data_range
+    if not any(map(math.isnan, ranges)) and not math.isclose(*ranges):
+        return []
     known = row.truths and reference.truths
     told_apart = known and row.measured["grid"] == reference.measured["grid"]
     if not told_apart and (row.scenes, row.measured) == (reference.scenes, reference.measured):

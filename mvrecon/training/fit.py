@@ -40,7 +40,14 @@ from mvrecon.methods.method import Solver
 from mvrecon.training import callbacks, checkpoints, run_folder
 from mvrecon.training.loop import WholeSteps, optimizer_steps
 from mvrecon.training.module import ReconstructionModule
-from mvrecon.training.resume import KeepLast, RandomNumbers, complete, report_checkpoint
+from mvrecon.training.resume import (
+    KeepLast,
+    RandomNumbers,
+    check_resumable,
+    complete,
+    kept,
+    report_checkpoint,
+)
 from mvrecon.training.settings import TrainSettings
 from mvrecon.training.targets import instantiate
 from mvrecon.training.tensorboard import TensorBoardReview
@@ -146,7 +153,8 @@ def check(settings: TrainSettings, data: SceneData, folder: Path, again: bool = 
     Raises:
         LookupError, TypeError, ImportError: a part that is missing, or a wrong option.
         ValueError: what the parts raise.
-        FileNotFoundError, Refused: weights or data that cannot be read.
+        FileNotFoundError, Refused: weights or data that cannot be read, or a checkpoint that lacks
+            what a training resumes from.
     """
     for name in METRICS.names():
         METRICS.get(name)
@@ -158,13 +166,16 @@ def check(settings: TrainSettings, data: SceneData, folder: Path, again: bool = 
             without_weights[method] = module
             continue
         done, last = checkpoints.finished(folder, method), checkpoints.unfinished(folder, method)
-        if done.exists():
-            checkpoints.read(done)
-        elif last.exists() or checkpoints.previous(last).exists():
-            checkpoints.read_newest(last)
+        state, begun = None, last.exists() or checkpoints.previous(last).exists()
+        if done.exists() or begun:
+            state = checkpoints.read(done) if done.exists() else checkpoints.read_newest(last)
         elif number == 0 and settings.init_from:
             begin_from(settings.init_from, module)
-        training |= again or not done.exists()
+        further = again or not done.exists()
+        if state is not None and further:
+            path = done if done.exists() else last
+            check_resumable(path, state, kept(settings, method))
+        training |= further
         module.build_optimizer()
         build_trainer(settings, folder, method)
     if training and world() == 1 and devices(settings.trainer) == 1:
@@ -279,7 +290,12 @@ def build_trainer(settings: TrainSettings, folder: Path, method: str) -> L.Train
     for hook in hooks:
         if isinstance(hook, callbacks.StepProgress | TensorBoardReview):
             hook.label = method
-    hooks += [callbacks.Confined(folder), callbacks.Clock(), RandomNumbers(), KeepLast(last)]
+    hooks += [
+        callbacks.Confined(folder),
+        callbacks.Clock(),
+        RandomNumbers(),
+        KeepLast(last, kept(settings, method)),
+    ]
     events = folder / method  # TensorBoard names a run by its folder
     loggers = [
         instantiate(

@@ -30,11 +30,16 @@ class WholeSteps(_TrainingEpochLoop):
             counts.ready = counts.started = counts.processed + 1
 
     def advance(self, data_fetcher: Any) -> None:
-        """Train on a batch; a training that stopped at the end of an epoch resumes after it.
+        """Train on a batch; a training that stopped at the end of an epoch resumes after it, and
+        one that stopped before or in a validation with that, which Lightning leaves out.
 
         Raises:
             StopIteration: no batch is left in a resumed epoch.
         """
+        if self.restarted_on_train_batch_end and self._should_check_val_fx(data_fetcher):
+            # logged as of the step before it was counted
+            self._batches_that_stepped -= not self._should_accumulate()
+            return
         ended = self.restarting and self._num_ready_batches_reached()
         if ended and not self._should_check_val_fx(data_fetcher):
             raise StopIteration

@@ -3,7 +3,7 @@
 import random
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any, TypedDict
 import lightning.pytorch as L
 import numpy as np
 import torch
+import yaml
 from lightning.pytorch.callbacks import (
     Checkpoint,
     EarlyStopping,
@@ -23,7 +24,8 @@ from lightning.pytorch.callbacks.early_stopping import EarlyStoppingReason
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from mvrecon.core.files.atomic import claimed
-from mvrecon.core.files.runs import RESULTS
+from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.runs import RESULTS, SETTINGS, flatten
 from mvrecon.core.machine import world
 from mvrecon.data.module import SceneData
 from mvrecon.training import run_folder
@@ -48,12 +50,13 @@ class KeepLast(Checkpoint):
 
     Args:
         path: path of the checkpoint; the previous one stays beside it.
+        settings: what `kept` returns; part of the checkpoint.
     """
 
     of_every_run = True
 
-    def __init__(self, path: Path):
-        self.path = path
+    def __init__(self, path: Path, settings: Mapping[str, Any]):
+        self.path, self.settings = path, dict(settings)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Replace Lightning's handler of SIGTERM, whose broadcast would wait for processes in
@@ -80,9 +83,10 @@ class KeepLast(Checkpoint):
     def on_save_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: TrainingState
     ) -> None:
-        """Leave out the elapsed times of timers, whose limits are those of a call: a resumed
-        training would stop again at once.
+        """Add the settings; leave out the elapsed times of timers, whose limits are those of a
+        call: a resumed training would stop again at once.
         """
+        checkpoint["settings"] = self.settings
         for hook in trainer.callbacks:  # pyrefly: ignore[missing-attribute]
             if isinstance(hook, Timer):
                 checkpoint["callbacks"].pop(hook.state_key, None)
@@ -112,6 +116,56 @@ def _moved(state: Any, before: Path, now: Path) -> Any:
     if isinstance(state, str) and Path(state).is_relative_to(before):
         return str(now / Path(state).relative_to(before))
     return state
+
+
+#: Settings of a run, and within `data` and `trainer`, that a resumed training may change.
+CHANGEABLE = {
+    *("name", "label", "compare", "test_scene", "plugins", "device", "init_from", "resume"),
+    *("logger", "workers", "cache"),
+    *("max_steps", "max_epochs", "max_time", "accelerator", "devices", "num_nodes", "strategy"),
+    *("log_every_n_steps",),
+}
+#: What a checkpoint must hold to resume from it.
+NEEDED = {
+    *("state_dict", "hyper_parameters", "global_step", "epoch", "pytorch-lightning_version"),
+    *("loops", "callbacks", "optimizer_states", "lr_schedulers", SceneData.__qualname__),
+}
+
+
+def kept(settings: TrainSettings, method: str) -> dict[str, Any]:
+    """The settings that determine the training of a method, by their full names; not paths, as the
+    digests of their files and cases are compared.
+    """
+    own = {**vars(settings), "method": settings.methods().get(method)}
+    plain = yaml.safe_load(yaml.safe_dump(own))  # as read from a run folder
+    return {
+        ".".join(map(str, keys)): value
+        for keys, value in flatten(plain)
+        if keys[-1] != "path"
+        and not CHANGEABLE.intersection(keys[: 1 + (keys[0] in ("data", "trainer"))])
+    }
+
+
+def check_resumable(path: Path, checkpoint: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """Check that a training can be resumed from a checkpoint.
+
+    Args:
+        path: path of the checkpoint.
+        checkpoint: what is read from it.
+        settings: what `kept` returns.
+
+    Raises:
+        Refused: it lacks something.
+        ValueError: the training began with other settings.
+    """
+    if missing := sorted(NEEDED - {*checkpoint}):
+        raise Refused(f"{path}: expected a training to resume, got one without {missing}")
+    changed = run_folder.differences(settings, checkpoint.get("settings", settings))
+    if changed:
+        raise ValueError(
+            f"{path} is of a training with other settings: {'; '.join(changed)}; restore them in "
+            f"{SETTINGS}, or begin another run with init_from=<this one>"
+        )
 
 
 class AveragedWeights(EMAWeightAveraging):

@@ -6,7 +6,8 @@ import json
 import math
 import platform
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from mvrecon import __version__
+from mvrecon.core import registry
 from mvrecon.core.files.atomic import claimed, write_text
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
 from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
@@ -33,7 +35,7 @@ RESULT_NAMES = (SETTINGS, RESULTS, "checkpoints", "cases")
 
 @contextmanager
 def run_lock(
-    folder: Path, settings: Mapping[str, object], file: str = SETTINGS, products: Sequence[str] = ()
+    folder: Path, settings: Mapping[str, Any], file: str = SETTINGS, products: Sequence[str] = ()
 ) -> Iterator[None]:
     """Context that locks a run folder, new or of a run with the same settings, and writes the
     settings. An error before the first result or checkpoint removes them if they are new, so that a
@@ -48,9 +50,13 @@ def run_lock(
     Raises:
         RuntimeError: another process uses the folder.
         ValueError, FileExistsError: it is another run's; see `check`.
+
+    Warns:
+        UserWarning: the run began with other versions or other code of its plugins.
     """
     with claimed(folder):
         check(folder, settings, file)
+        compare_versions(folder, settings)
         own = (file, VERSIONS, DIGESTS_FILE, RIG)
         new, started = (
             [folder / name for name in names if not (folder / name).exists()]
@@ -131,8 +137,33 @@ def compare_measurement(folder: Path, got: Mapping[str, str]) -> None:
     digests.compare(got, expected, f"{path} (its rig is kept as {RIG})")
 
 
-def versions(*others: str) -> dict[str, str]:
-    """Versions of Python, of mvrecon, of its numerical dependencies and of other distributions.
+def compare_versions(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Compare the versions with those in a run folder, if present.
+
+    Warns:
+        UserWarning: they differ, by more than the platform; the message names all differences.
+    """
+    if not (folder / VERSIONS).is_file():
+        return
+    lines = text_of(folder / VERSIONS).splitlines()
+    before = {name: version for name, _, version in (line.partition(" ") for line in lines)}
+    now = versions(registry.names(settings.get("plugins")))
+    changed = [
+        f"{name} {before[name]} became {version}"
+        for name, version in now.items()
+        if name != "platform" and before.get(name, version) != version
+    ]
+    if changed:
+        warnings.warn(
+            f"{folder} began with other versions: {'; '.join(changed)}. What is there already "
+            f"stays as it is",
+            stacklevel=3,
+        )
+
+
+def versions(plugins: Iterable[str] = (), others: Iterable[str] = ()) -> dict[str, str]:
+    """Versions of Python, of mvrecon, of its numerical dependencies, of installed plugins and of
+    other distributions, and digests of the code of the modules `plugins`, which are imported.
 
     Torch's own version includes the build (2.13.0+cu130), which the package index omits.
     """
@@ -149,15 +180,17 @@ def versions(*others: str) -> dict[str, str]:
             packages[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             packages[name] = "not installed"
-    return packages
+    packages |= {
+        point.dist.name: point.dist.version for point in registry.installed() if point.dist
+    }
+    return packages | {name: f"sha256:{code}" for name, code in digests.of_code(plugins).items()}
 
 
-def start(folder: Path, settings: Mapping[str, object], file: str = SETTINGS) -> None:
+def start(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
     """Write a run's settings, plain and resolved, and the versions."""
     write_text(folder / file, yaml.safe_dump(dict(settings), sort_keys=False))
-    write_text(
-        folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in versions().items())
-    )
+    lines = versions(registry.names(settings.get("plugins"))).items()
+    write_text(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in lines))
 
 
 def read_settings(folder: Path) -> TrainSettings:

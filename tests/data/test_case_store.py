@@ -12,6 +12,7 @@ from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.data.acquisition.disturbances import Disturbance
 from mvrecon.data.dataset import CaseStore
+from mvrecon.data.digests import files_in
 from mvrecon.data.module import SceneData
 from mvrecon.geometry.grid import Grid
 from tests.data.conftest import RIG
@@ -223,3 +224,81 @@ def test_an_edited_scene_of_a_plugin_is_computed_anew(package, factory, tmp_path
     first = truth(0.01)
     assert truth(0.02) == pytest.approx(2 * first) and truth(0.01) == first
     assert len(list((tmp_path / "cases").iterdir())) == 2
+
+
+#: Where the value of an edited scene is written, by what the scene is: files, with that of the
+#: value last, and the options of the scene.
+CLASS = (
+    "from mvrecon.core.parts import SCENES\n"
+    "from mvrecon.data.scenes.sample import Scene\n"
+    "class {base}(Scene):\n"
+    "    data_range, unit = 0.02, '1/mm'\n"
+    "    def sample(self, *case):\n"
+    "        return SCENES.build('ellipsoids', value=VALUE).sample(*case)\n"
+)
+LATER = "\n@SCENES.register('{name}')\nclass Mine(Base): pass\n"
+EDITED = {
+    "base class elsewhere": {
+        "{name}.py": "from mvrecon.core.parts import SCENES\nfrom {name}_base import Base" + LATER,
+        "{name}_base.py": "VALUE = {value}\n" + CLASS.format(base="Base"),
+    },
+    "module beside": {
+        "{name}.py": "from {name}_value import VALUE\n" + CLASS.format(base="Base") + LATER,
+        "{name}_value.py": "VALUE = {value}\n",
+    },
+    "part of a mixture": {
+        "{name}.py": "VALUE = {value}\n" + CLASS.format(base="Base") + LATER,
+    },
+    "table of a package": {
+        "{name}/__init__.py": "from importlib.resources import files\n"
+        "VALUE = float(files('{name}').joinpath('value.txt').read_text())\n"
+        + CLASS.format(base="Base")
+        + LATER,
+        "{name}/value.txt": "{value}\n",
+    },
+}
+
+
+@pytest.mark.parametrize("kind", EDITED)
+def test_whatever_an_edited_plugin_is_made_of_its_cases_are_computed_anew(
+    kind, tmp_path, monkeypatch, registries
+):
+    """Cases of the former value are not taken for those of the new one."""
+    name = "edited_" + kind.replace(" ", "_")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    scene = {"name": name}
+    if kind == "part of a mixture":
+        scene = {"name": "mixture", "scenes": [scene]}
+
+    def truth(number):
+        for file, text in EDITED[kind].items():
+            path = tmp_path / file.format(name=name)
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text.format(name=name, value=number))
+        for module in [key for key in sys.modules if key.startswith(name)]:
+            del sys.modules[module]
+        importlib.invalidate_caches()
+        SCENES._parts.pop(name, None)
+        importlib.import_module(name)
+        data = SceneData(
+            dict.fromkeys(("train", "test"), scene),
+            {"grid": {"shape": [8, 8, 8], "spacing": 6.0}, "camera": RIG},
+            {"train": 1, "val": 1, "test": 1},
+            cache=str(tmp_path / "cases"),
+        )
+        data.setup("test")
+        return data.sets["test"].prepare()["volume"].max().item()
+
+    first = truth(0.01)
+    assert truth(0.02) == pytest.approx(2 * first) and truth(0.01) == first
+    assert len(list((tmp_path / "cases").iterdir())) == 2
+
+
+def test_the_files_of_a_list_and_a_folder_by_its_absolute_path_are_among_a_part_s_files(tmp_path):
+    """A plugin's options `paths` and `atlas`; not a word that is a folder's name, here or there."""
+    files = [str(tmp_path / name) for name in ("a.nii", "b.nii")]
+    for file in files:
+        (tmp_path / file).write_text("values")
+    scene = {"paths": files, "atlas": str(tmp_path), "mode": "tests", "each": [{"path": "tests"}]}
+    assert list(files_in(scene)) == [*files, str(tmp_path), "tests"]

@@ -249,6 +249,23 @@ def test_tables_state_their_test_scenes_themselves(tmp_path):
     assert math.isnan(paired(runs["a"], runs["b"])) and paired(runs["a"], runs["c"]) == 0.0
 
 
+def test_figures_of_different_data_ranges_are_not_subtracted(tmp_path):
+    """The same cases with `test_scene.data_range` of 0.02 and 0.04: PSNR differs by 6.02 dB without
+    any difference of the volumes. Ranges that round differently, or are not known, are paired.
+    """
+    tables = {}
+    for name, data_range in (("a", 0.02), ("b", 0.04), ("c", 0.02 * (1 + 1e-12)), ("old", None)):
+        folder = run(tmp_path / name, {}, truths=[1, 2, 3, 4], ours=(EASY, 1.0))
+        table = json.loads((folder / "results.json").read_text())
+        if data_range is not None:
+            table["data_range"] = data_range
+        (folder / "results.json").write_text(json.dumps(table))
+        (tables[name],) = read([folder])
+    for one, other, pairs in (("a", "b", 0), ("b", "a", 0), ("a", "c", 4), ("a", "old", 4)):
+        assert len(comparison.common_scenes(tables[one], tables[other])) == pairs
+    assert math.isnan(comparison.difference(tables["a"], tables["b"], "psnr").mean)
+
+
 @pytest.mark.parametrize("values", ["psnr", "truths", "scenes"])
 @pytest.mark.parametrize("count", [3, 5])
 def test_a_table_with_other_numbers_of_values_than_scenes_is_refused(tmp_path, values, count):

@@ -39,6 +39,27 @@ def test_a_training_killed_in_a_step_and_resumed_ends_with_the_same_bits(tmp_pat
     assert lives.different(lives.state(tmp_path / "whole"), lives.state(tmp_path / "killed")) == []
 
 
+@pytest.mark.parametrize("every", [3, pytest.param(5, marks=pytest.mark.long)])
+def test_a_training_stopped_before_a_validation_resumes_with_it(every, tmp_path):
+    """Of several batches, within an epoch and at its end: the log has its row, there under the
+    next epoch's number, and the run's best checkpoint is one of all.
+    """
+    options = (*SHORT, "data.sizes={train: 10, val: 6, test: 1}", "trainer.log_every_n_steps=1")
+    options += (f"trainer.val_check_interval={every}", "callbacks=best")
+    look = {"what": "look"}
+    stopped = {"whole": [], "stopped": [{"what": "term", "n": every}, look]}
+    ended = lives.play(tmp_path, stopped, *options)["stopped"]
+    assert [life["exit"] for life in ended] == [1, 0, 0] and ended[1]["said"] == f"step {every}"
+    whole, again = (
+        [{k: v for k, v in row.items() if (k, every) != ("epoch", 5)} for row in rows(folder)]
+        for folder in (tmp_path / name for name in stopped)
+    )
+    assert whole == again and sum(bool(row["val/psnr"]) for row in whole) == 7 // every
+    states = [lives.state(tmp_path / name)["callbacks"] for name in stopped]
+    best = [next(state[k] for k in state if k.startswith("ModelCheckpoint")) for state in states]
+    assert best[0]["best_model_score"] == best[1]["best_model_score"]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("workers", [0, 2])
 def test_kills_at_random_steps_and_while_writing_change_no_bit(workers, tmp_path):

@@ -7,6 +7,7 @@ import socket
 import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryFile, mkdtemp
@@ -156,7 +157,7 @@ def written_or_kept(path: Path, write: Callable[[Path], None], places: Sequence[
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
     """Context that locks a folder for this process, and deletes incomplete files of killed
-    processes in it.
+    processes in it, except below a folder with a lock of its own, whose process may be alive.
 
     The lock ends with the process, however that ends; worker processes do not inherit it. An error
     of a full disk that names no file, as a logger's, names the folder.
@@ -180,7 +181,7 @@ def claimed(folder: Path) -> Iterator[None]:
         lock.truncate(0)
         lock.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         lock.flush()
-        for part in [*folder.rglob(f".*.[0-9]*{PART_ENDING}")]:
+        for part in [*_parts(folder)]:
             shutil.rmtree(part) if part.is_dir() else part.unlink(missing_ok=True)
         try:
             yield
@@ -188,6 +189,15 @@ def claimed(folder: Path) -> Iterator[None]:
             if error.filename is None and error.errno in FULL:
                 error.filename = str(folder)
             raise
+
+
+def _parts(folder: Path) -> Iterator[Path]:
+    """Incomplete files and folders below a folder, without those of other runs."""
+    for path in folder.iterdir():
+        if fnmatch(path.name, f".*.[0-9]*{PART_ENDING}"):
+            yield path
+        elif path.is_dir() and not (path / LOCK_FILE).exists():
+            yield from _parts(path)
 
 
 def new_folder(path: str | Path) -> Path:

@@ -115,7 +115,7 @@ def machine() -> dict[str, str]:
     """Processor, threads, GPU, and versions of the libraries compared."""
     has_gpu = torch.cuda.is_available()
     return {
-        **run_folder.versions(*PEERS),
+        **run_folder.versions(others=PEERS),
         "processor": processor(),
         "cores": str(os.cpu_count()),
         "threads": str(torch.get_num_threads()),

@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from mvrecon.core.files.atomic import claimed
+from mvrecon.core.files.atomic import claimed, written_whole
 
 CLAIM = (
     "import sys, pathlib; from mvrecon.core.files.atomic import claimed\nwith "
@@ -25,3 +25,21 @@ def test_a_run_folder_is_locked_until_its_process_ends(run_python, tmp_path):
         and "hydra.run.dir" in refused.stderr
     )
     assert run_python("-c", CLAIM, str(tmp_path)).returncode == 0
+
+
+@pytest.mark.parametrize("name", ["run", "sweep/date/run"])
+def test_a_claim_removes_nothing_of_a_run_below(name, tmp_path):
+    """The run in a subfolder writes on; leftovers of the claimed folder go. Tried: a training in
+    outputs/ while another writes in outputs/<experiment>/<date>, and a sweep's folder.
+    """
+    run = tmp_path / name
+    left = [tmp_path / ".results.json.1.part", tmp_path / "cases" / ".views.2.part" / "view.tif"]
+    for path in left:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("half")
+    with claimed(run), written_whole(run / "checkpoints" / "last.ckpt") as part:
+        part.write_text("whole")
+        with claimed(tmp_path):
+            pass
+    assert (run / "checkpoints" / "last.ckpt").read_text() == "whole"
+    assert not any(path.exists() for path in left)
