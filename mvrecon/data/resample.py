@@ -256,7 +256,7 @@ def cut(volume: Volume, source: Grid, target: Grid) -> Volume:
 
 
 def _sampled(volume: Volume, source: Grid, target: Grid) -> Float[Tensor, "e i j"]:
-    split = max(1, round(max(_steps(source, target))))
+    split = max(1, math.ceil(max(_steps(source, target)) - 0.5 - 1e-6))  # 1.5 blocks: one point
     fine = target.refined(split)
     slab = max(1, BLOCK_POINTS // (fine.shape[1] * fine.shape[2] * split)) * split
     parts = []

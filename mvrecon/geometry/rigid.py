@@ -142,7 +142,8 @@ def look_at(
     vertical = unit(forward.new_tensor(up)).expand_as(forward)
     if not vertical.isfinite().all():
         raise ValueError(f"A camera's up must be finite, got {up}")
-    across = torch.eye(3).to(forward)[forward.abs().argmin(dim=-1)]
+    # of equal ones the first, whatever rounding makes of zeros
+    across = torch.eye(3).to(forward)[forward.abs().round(decimals=6).argmin(dim=-1)]
     along = torch.linalg.cross(forward, vertical).norm(dim=-1, keepdim=True) < math.sqrt(
         torch.finfo(forward.dtype).eps
     )

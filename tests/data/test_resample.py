@@ -30,6 +30,18 @@ def test_a_linear_field_is_resampled_exactly_to_turned_axes(spacing):
     assert torch.allclose(resample(plane(SOURCE), SOURCE, target), plane(target), atol=2e-5)
 
 
+@pytest.mark.parametrize("nudge", [1e-13, -1e-13, 1e-10, -1e-10])
+def test_rounding_does_not_decide_the_points_in_a_voxel(nudge):
+    """Of target voxels one and a half times as large. Also tried: 1, 2, 2.5, 3 and 3.5 times."""
+    values = torch.rand(20, 20, 20, generator=torch.Generator().manual_seed(0))
+    source = Grid.centred(20, spacing=2.0)
+    one, other = (
+        resample(values, source, turned(Grid.centred(12, spacing=mm), (0, 0, 10)))
+        for mm in (3.0, 3.0 * (1 + nudge))
+    )
+    torch.testing.assert_close(one, other)
+
+
 @pytest.mark.parametrize("factors", [(1, 1, 1), (2, 2, 2), (3, 1, 2)])
 def test_a_linear_field_is_resampled_exactly_to_whole_blocks(factors):
     target = pooled(

@@ -108,6 +108,16 @@ def test_a_camera_above_or_below_its_target_has_valid_axes(height):
     torch.testing.assert_close(R[2], -math.copysign(1, height) * EYE[2])
 
 
+@pytest.mark.parametrize("nudge", [1e-13, -1e-13, 1e-10])
+def test_rounding_does_not_turn_a_camera_whose_up_is_its_line_of_sight(nudge):
+    """About any axis of the world."""
+    for axis, aside in ((2, 0), (2, 1), (0, 1), (0, 2), (1, 0), (1, 2)):
+        source = 100 * EYE[axis]
+        R = look_at(source, torch.zeros(3), EYE[axis].tolist())
+        near = look_at(source + 100 * nudge * EYE[aside], torch.zeros(3), EYE[axis].tolist())
+        torch.testing.assert_close(near, R)
+
+
 def test_a_camera_at_its_target_is_refused():
     with pytest.raises(ValueError, match="must not be at the point"):
         look_at(torch.ones(2, 3), torch.ones(2, 3))

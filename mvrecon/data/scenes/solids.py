@@ -347,7 +347,7 @@ def _block(
     half = frame[:, :k].norm(dim=1) + frame[:, k:].abs().sum(dim=1) + 0.5
     low, high = (centre - half).ceil().long().tolist(), (centre + half).floor().long().tolist()
     x, y, z = (
-        slice(max(0, a), max(0, min(n, b + 1)))
+        slice(min(n, max(0, a)), max(0, min(n, b + 1)))
         for a, b, n in zip(low, high, grid.shape[::-1], strict=True)
     )
     return z, y, x

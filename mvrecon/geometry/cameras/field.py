@@ -35,6 +35,8 @@ BISECTION_STEPS = 40
 MAX_WIDTH_RATIO, MAX_GAP_STEPS, MAX_GAP = 0.75, 2.0, math.radians(15.0)
 #: Views within this angle are exposures of one direction, as encoders repeat it.
 SAME_ANGLE = math.radians(0.05)
+#: Rounding of pixels, ratios and angles, which decides nothing.
+ROUNDING_ERROR = 1e-6
 
 
 def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
@@ -61,12 +63,12 @@ def isocentre(cameras: Cameras) -> Float[Tensor, "3"]:
 
 
 def sees(cameras: Cameras, xyz: Float[Tensor, "n 3"]) -> Bool[Tensor, "m n"]:
-    """Whether each camera sees points in world mm: on its detector, within the valid
-    range of rays.
+    """Whether each camera sees points in world mm: on its detector, edges included, within the
+    valid range of rays.
     """
     uvz = cameras.project(xyz)
-    edge = uvz.new_tensor(cameras.shape[::-1]) - 0.5
-    within = ((uvz[..., :2] >= -0.5) & (uvz[..., :2] <= edge)).all(dim=-1)
+    half = uvz.new_tensor(cameras.shape[::-1]) / 2
+    within = ((uvz[..., :2] + 0.5 - half).abs() <= half + ROUNDING_ERROR).all(dim=-1)
     return within & cameras.valid(uvz)
 
 
@@ -188,10 +190,8 @@ def full_fan(cameras: Cameras) -> Cameras:
         return cameras
     column = rig.project(centre)[:, 0]
     left, right = column + 0.5, rig.shape[1] - 0.5 - column
-    if not (
-        ((left / right < MAX_WIDTH_RATIO) | (right / left < MAX_WIDTH_RATIO)).all()
-        and left.min() > 0
-    ):
+    ratio = torch.minimum(left, right) / torch.maximum(left, right)
+    if not (ratio.max() < MAX_WIDTH_RATIO + ROUNDING_ERROR and left.min() > 0):
         return cameras
     one_sided = (left < right).all() or (left > right).all()
     ways = unit(rig.origin - rig.source if rig.parallel else centre - rig.source)
@@ -204,9 +204,9 @@ def full_fan(cameras: Cameras) -> Cameras:
         if angle - last > SAME_ANGLE:
             directions, last = directions + 1, angle
     widest = max(MAX_GAP, MAX_GAP_STEPS * 2 * math.pi / directions)
-    if not one_sided or directions < 3 or gaps.max() > widest:
+    if not one_sided or directions < 3 or gaps.max() > widest + ROUNDING_ERROR:
         return cameras
-    more = math.ceil((left - right).abs().max().item() - 1e-6)
+    more = math.ceil((left - right).abs().max().item() - ROUNDING_ERROR)
     first = cameras.source.new_tensor([[-float(more) if left[0] < right[0] else 0.0, 0.0]])
     return replace(cameras.shifted(first), shape=(rig.shape[0], rig.shape[1] + more))
 
@@ -223,7 +223,7 @@ def pixels_of_voxel(cameras: Cameras, grid: Grid) -> int:
     """Whole pixels that the image of a voxel at the grid's centre holds along its longest edge, one
     at least; rounding does not decide them.
     """
-    return max(1, int(max(grid.spacing) / resolution(cameras, grid.centre) + 1e-6))
+    return max(1, int(max(grid.spacing) / resolution(cameras, grid.centre) + ROUNDING_ERROR))
 
 
 def check_rig_sees(cameras: Cameras, grid: Grid) -> Bool[Tensor, " m"]:

@@ -397,7 +397,8 @@ def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
         )
     width = min(x, y)
     diagonal = math.hypot(grid.shape[2] * (x / width), grid.shape[1] * (y / width))
-    detector = {"pixels": [grid.shape[0], bins or math.ceil(diagonal)], "pixel_mm": [z, width]}
+    bins = bins or math.ceil(diagonal - 1e-6)
+    detector = {"pixels": [grid.shape[0], bins], "pixel_mm": [z, width]}
     rig = parallel(angles, detector, 2 * width * diagonal, arc_degrees=360.0, start_degrees=90.0)
     rows, columns = rig.shape
     turned = (columns - 1) * rig.u + (rows - 1) * rig.v  # rows upwards, in the order of slices

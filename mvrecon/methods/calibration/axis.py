@@ -99,13 +99,15 @@ def refined_axis(
     every = math.ceil(len(cameras) / MAX_VIEWS)
     rig, views = cameras[::every], views[:, :, ::every]
     sides = _sides(grid, orbit)
-    wide, most = sides.max().item() / resolution(rig, orbit.centre), max(len(rig), VOXELS[0])
+    # to six decimals, so that rounding decides neither the slice nor its pixels
+    wide = round(sides.max().item() / resolution(rig, orbit.centre), 6)
+    most = max(len(rig), VOXELS[0])
     offset, uncertainty, least, noise = 0.0, math.inf, math.inf, 0.0
     for size in sorted({min(n, max(1, round(wide))) for n in VOXELS if n <= most}):
         box, pixels = _slice(grid, orbit, sides, size), wide / size
         rows, columns = max(1, min(round(pixels), rig.shape[0])), max(1, int(pixels / 2))
         middle = rig.project(orbit.centre[None])[:, 0, 1].median().item()
-        first, last = round(middle - (rows - 1) / 2), rig.shape[1] // columns * columns
+        first, last = round(round(middle, 6) - (rows - 1) / 2), rig.shape[1] // columns * columns
         if not 0 <= first <= rig.shape[0] - rows:
             break
         part = rig.cropped((first, first + rows), (0, last)).binned((rows, columns))

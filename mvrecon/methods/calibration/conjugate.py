@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.field import ROUNDING_ERROR
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.calibration.axis import KEPT, Axis, scatter
 from mvrecon.methods.calibration.from_data import MAX_LEFT_OUT
@@ -67,9 +68,11 @@ class _Lines(NamedTuple):
         angle = math.pi - (0 if self.camera.parallel else 2) * rays
         turn = abs(2 * math.pi / self.step)
         view = torch.arange(0, views, every).double()[:, None] + angle / self.step
-        view = torch.remainder(view, turn)
+        # rounding does not decide between the first and the last view
+        view = torch.remainder(view + ROUNDING_ERROR, turn) - ROUNDING_ERROR
         last = views if abs(turn - views) < 0.5 else views - 1  # the first view follows
-        inside = (view <= last) & (column >= 0) & (column <= columns - 1)
+        inside = (view <= last + ROUNDING_ERROR) & (column >= -ROUNDING_ERROR)
+        inside &= column <= columns - 1 + ROUNDING_ERROR
         i = view.floor().clamp(0, last - 1).long()
         j = column.floor().clamp(0, columns - 2).long().expand_as(i)
         a, b = view - i, column - j

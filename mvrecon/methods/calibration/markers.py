@@ -85,7 +85,8 @@ def _centroid(
         low = (place - radius).floor().long().tolist()
         window = tuple(slice(n, n + round(2 * radius) + 2) for n in reversed(low))
         values, at = view[window], pixels[window]
-        distance = (at - place).norm(dim=-1)
+        # rounding does not decide whether pixels at the radius itself are within
+        distance = (at - place).norm(dim=-1).round(decimals=6)
         slope = torch.cat([at - place, torch.ones_like(at[..., :1])], dim=-1)
         rim = (distance > radius - 1) & (distance <= radius)
         plane = torch.linalg.lstsq(slope[rim], values[rim][:, None]).solution

@@ -115,7 +115,7 @@ def _turn(cameras: Cameras, grid: Grid) -> Orbit:
             f"FBP needs parallel beams from two directions at least, got {len(beams)} views along "
             f"one line"
         )
-    axis = axes[2]
+    axis = _against(cameras.v, axes[2])
     if (leave := (beams @ axis).abs().max().item()) > MAX_ORBIT_DEVIATION:
         raise ValueError(
             f"FBP needs parallel beams that are turned about one axis, got directions that leave "
@@ -161,7 +161,12 @@ def _circle(cameras: Cameras) -> Orbit:
             f"up to {extent * off:.4g} mm; use sirt"
         )
     centre, radius = mean + extent * (fit[:2] @ axes[:2]), extent.item() * radius
-    return Orbit(axes[2], centre, radius, unit(out) @ axes[:2])
+    return Orbit(_against(cameras.v, axes[2]), centre, radius, unit(out) @ axes[:2])
+
+
+def _against(v: Float[Tensor, "m 3"], axis: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """The axis that detector columns run against: a singular vector's sign is rounding's."""
+    return torch.where((v @ axis).sum() > 0, -axis, axis)
 
 
 def _check_rows(cameras: Cameras, orbit: Orbit) -> None:

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import SAME_ANGLE
+from mvrecon.geometry.cameras.field import ROUNDING_ERROR, SAME_ANGLE
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.orbit import Orbit, along, fan_coordinate, orbit_of
 
@@ -50,6 +50,8 @@ MIN_TAPER = math.radians(30.0)
 PANEL_TAPER, NEIGHBOUR_STEPS, NEIGHBOUR_DEVIATIONS = 0.5, 1.0, 4.0
 #: Kinks of a line's distance from the edge of a panel are rounded over this part of the distance.
 ROUNDING = 0.2
+#: A direction in which a scan has no view, and that no symmetry of one keeps.
+ASIDE = (0.81, 0.47, 0.35)
 #: Share of the lines at any one distance from the axis that are not measured, from which a warning
 #: is given: at the rim of a fan whose arc is 8 degrees short values are 2 % off.
 WARNED_MISSING = 0.01
@@ -132,9 +134,10 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
         )
     limit = max(field, reach)
     q = torch.linspace(-limit, limit, 2 * FAN_DISTANCES + 1, dtype=torch.float64)
-    angles = torch.deg2rad(orbit.angles).remainder(FULL_TURN)
-    start = _start(angles)
-    angles, order = (angles - start).remainder(FULL_TURN).sort()
+    # rounding does not make the first view the last one
+    start = _start(orbit)
+    angles = torch.deg2rad(orbit.angles) - start + ROUNDING_ERROR
+    angles, order = (angles.remainder(FULL_TURN) - ROUNDING_ERROR).sort()
     edge = torch.minimum(q[:, None] - low[order], high[order] - q[:, None])  # [q m]
     branches = _Branches.of(angles, edge, q, cameras.parallel, min(field, reach))
     # values are those of voxels' centres, and between the angles of two views lines are theirs
@@ -317,7 +320,7 @@ def _distributed(
     step = torch.where(gaps > sigma, sigma / NEIGHBOUR_STEPS, gaps)
     width = _of_exposures(step + step.roll(1), angles)
     ahead = torch.cat([angles, angles + FULL_TURN])
-    ahead = torch.searchsorted(ahead, angles + NEIGHBOUR_DEVIATIONS * sigma, right=True)
+    ahead = torch.searchsorted(ahead, angles + NEIGHBOUR_DEVIATIONS * sigma + ROUNDING_ERROR)
     most = int((ahead - torch.arange(1, len(angles) + 1)).max())
     shifts = range(-min(most, (len(angles) - 1) // 2), min(most, (len(angles) - 1) // 2) + 1)
 
@@ -399,14 +402,16 @@ def _raster(views: int, usual: float) -> int:
     return least if steps > least else steps * 2 * math.ceil(least / (2 * steps))
 
 
-def _start(angles: Float[Tensor, " m"]) -> float:
-    """The angle behind the widest gap, from which results depend neither on the order of the views
-    nor on which of them is the first.
+def _start(orbit: Orbit) -> float:
+    """The angle behind the widest gap, in radians from the first view; of several as wide the first
+    one from a direction in the world, so that results do not depend on the order of the views.
     """
-    angles = angles.sort().values
+    aside = orbit.axis.new_tensor(ASIDE)
+    zero = torch.atan2(orbit.tangents[0] @ aside, orbit.outwards[0] @ aside)
+    angles = (torch.deg2rad(orbit.angles) - zero).remainder(FULL_TURN).sort().values
     gaps = _gaps(angles)
-    widest = int((gaps > gaps.max() - 1e-6).int().argmax())
-    return angles[(widest + 1) % len(angles)].item()
+    widest = int((gaps > gaps.max() - ROUNDING_ERROR).int().argmax())
+    return (zero + angles[(widest + 1) % len(angles)]).item()
 
 
 def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
@@ -419,7 +424,7 @@ def _of_exposures(
 ) -> Float[Tensor, "*n m"]:
     """The mean of the cells of the views at each of sorted angles, several exposures or panels."""
     gaps = _gaps(angles)
-    begins = (gaps > EXPOSURE_STEP_SHARE * _usual(gaps)).roll(1)
+    begins = (gaps > EXPOSURE_STEP_SHARE * _usual(gaps) - ROUNDING_ERROR).roll(1)
     if begins.all() or not begins.any():
         return cells
     number = (begins.cumsum(0) - 1).remainder(int(begins.sum()))  # the first may continue the last

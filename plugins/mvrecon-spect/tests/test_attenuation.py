@@ -9,8 +9,9 @@ import weakref
 import pytest
 import torch
 
-from mvrecon.geometry.cameras.rigs import dcspect80
+from mvrecon.geometry.cameras.rigs import Detector, dcspect80
 from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import look_at
 from mvrecon.operators.selection import view_subset
 from mvrecon_spect.operators import footprints
 from mvrecon_spect.operators.path_integrals import path_integrals
@@ -64,6 +65,20 @@ def test_path_integrals_of_smooth_attenuation_converge_in_second_order(moving):
         errors.append(((made.detach() - exact).norm() / exact.norm()).item())
     assert errors[0] < 0.0015
     assert math.log(errors[0] / errors[1], 8) > 1.8
+
+
+@pytest.mark.parametrize(("count", "spacing"), [(66, 5.0), (33, 4.0)])
+def test_rounding_does_not_decide_the_steps_of_path_integrals(count, spacing):
+    """A whole number of steps of a third of a voxel."""
+    source = torch.tensor([[300.0, 0, 0], [0, 300, 0]]).double()
+    R, panel = look_at(source, torch.zeros(2, 3)), {"pixels": [16, 16], "pixel_mm": 4.0}
+    cameras = Detector.of(panel).carried(source, 1.2 * source, R, extent="behind")
+    mu = 0.01 * torch.rand(count, count, count, generator=torch.Generator().manual_seed(0))
+    grid, matter = Grid.centred(8, spacing=20.0), Grid.centred(count, spacing=spacing)
+    exact = path_integrals(mu, matter, cameras, grid)
+    for nudge in (1e-13, -1e-13, 1e-12, -1e-12):
+        near = Grid.centred(count, spacing=spacing * (1 + nudge))
+        torch.testing.assert_close(path_integrals(mu, near, cameras, grid), exact)
 
 
 @pytest.fixture

@@ -127,6 +127,18 @@ def test_an_edge_visible_in_ct_is_not_penalised():
     assert guided(inner).item() == pytest.approx(plain(torch.where(edge > 1, 1, inner)).item())
 
 
+@pytest.mark.parametrize("similar", [1, 7, 20])
+def test_rounding_does_not_choose_among_equal_neighbours(similar):
+    """Of an anatomy in Hounsfield units, and of one in 1/mm."""
+    rng = torch.Generator().manual_seed(0)
+    x = torch.rand(1, 1, *SHAPE, generator=rng)
+    for unit in (1000.0, 0.0096):
+        exact = unit * (1 + anatomy().float())
+        near = exact * (1 + 1e-7 * torch.randn(SHAPE, generator=rng))
+        one, other = (prior(anatomy=f, similar=similar).gradient(x) for f in (exact, near))
+        torch.testing.assert_close(one, other)
+
+
 @pytest.mark.parametrize(
     "options",
     [

@@ -16,7 +16,7 @@ from mvrecon_spect.metrics.contrast import (
     sphere_recovery,
 )
 from mvrecon_spect.metrics.derenzo import valley_to_peak
-from mvrecon_spect.metrics.edge import ball_mtf
+from mvrecon_spect.metrics.edge import ball_mtf, plane_mtf
 from mvrecon_spect.metrics.polar_map import LongAxis, polar_map, segments
 from mvrecon_spect.metrics.repeated import repeated
 
@@ -183,3 +183,30 @@ def test_metrics_of_inconsistent_input_are_refused():
     ):
         with pytest.raises(ValueError, match=message):
             act()
+
+
+@pytest.mark.parametrize("nudge", [1e-13, -1e-13, 1e-10, -1e-10])
+def test_rounding_does_not_decide_bins_and_samples(nudge):
+    """Of edges between voxels, and of rays that whole steps fill. Also tried: voxels of 0.1 to
+    4 mm, and planes of three slopes.
+    """
+    grid = Grid.centred(48, spacing=1.0)
+    affine = grid.affine.clone()
+    affine[:3] *= 1 + nudge
+    normal = torch.tensor([1.0, 0.1, 0.0]).double()
+    plane = torch.sigmoid(voxel_centres(grid) @ normal / 0.7)
+    ball = torch.sigmoid((13 - distance(grid)) / 0.7)
+    for one, other in (
+        (((0.0, 0, 0), normal, 12.0), ((nudge, nudge, 0), normal, 12.0 * (1 + nudge))),
+        (((0.0, 0, 0), normal, 12.0), ((0, 0, nudge), normal, 12.0 * (1 - nudge))),
+    ):
+        found = plane_mtf(plane, grid, *other).values
+        torch.testing.assert_close(found, plane_mtf(plane, grid, *one).values)
+    along = ball_mtf(ball, grid, (0, 0, 0), 26.0, (0, 0, 1)).values
+    near = ball_mtf(ball, grid, (0, 0, 0), 26.0 * (1 + nudge), (0, 0, 1)).values
+    torch.testing.assert_close(near, along)
+    wall = torch.exp(-((distance(grid) - 5).square() / 0.64))
+    axis = LongAxis((0.0, 0, 6), (0.0, 0, -6), (1.0, 0, 0))
+    exact = polar_map(wall, grid, axis, 10.0)
+    torch.testing.assert_close(polar_map(wall, grid, axis, 10.0 * (1 + nudge)), exact)
+    torch.testing.assert_close(polar_map(wall, Grid(grid.shape, affine), axis, 10.0), exact)

@@ -102,3 +102,13 @@ def test_the_voxels_that_are_subdivided_grow_with_the_surface_not_with_the_volum
 def test_a_factor_below_one_is_refused():
     with pytest.raises(ValueError, match="at least 1, got 0"):
         voxelise(Phantom((solids("box"),)), Grid.centred((4, 4, 4), 10.0), 0)
+
+
+@pytest.mark.parametrize("kind", ROUND_AXES)
+@pytest.mark.parametrize("away", [-500.0, 500.0])
+def test_a_solid_beside_the_grid_leaves_it_empty(kind, away):
+    """On either side; the upper one raised a RuntimeError."""
+    beside = solids(kind)
+    for axis in range(3):
+        phantom = Phantom((beside,)).moved(torch.eye(3), away * torch.eye(3)[axis])
+        assert not voxelise(phantom, Grid.centred(size=(6, 5, 4), spacing=3.0)).any()

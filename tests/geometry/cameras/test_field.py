@@ -78,6 +78,24 @@ def test_the_field_of_a_half_fan_is_that_of_the_lines_it_measures():
     assert full_fan(whole) is whole
 
 
+@pytest.mark.parametrize("nudge", [1e-13, -1e-13, 1e-10, -1e-10])
+def test_rounding_does_not_decide_the_field(nudge):
+    """Of panels three quarters as wide at one side of the axis, of a gap of 15 degrees, and of
+    voxels on the edge of a panel. Also tried: other pitches, panels and first angles.
+    """
+    panel = {"pixels": [4, 56], "pixel_mm": 0.3, "offset_mm": [0.0, 1.2 * (1 + nudge)]}
+    assert full_fan(parallel(90, panel, arc_degrees=360.0)).shape[1] == 64
+    angles = [(5.0 * k + 10.0) * (1 + nudge) for k in range(72) if k not in (7, 8)]
+    panel = {"pixels": [4, 64], "pixel_mm": 1.0, "offset_mm": [0.0, 16.0]}
+    assert full_fan(circular(70, 200.0, 300.0, panel, angles=angles)).shape[1] == 96
+    grid, field = Grid.centred(33, spacing=1.0), torch.zeros(1, 33, 33, 33, dtype=torch.bool)
+    x, y, z = voxel_centres(grid).unbind(dim=-1)
+    field[0] = (x.square() + y.square() <= 256) & (z.abs() <= 16)
+    rig = parallel(36, {"pixels": [32, 32], "pixel_mm": 1 + nudge})
+    rim = (x.square() + y.square() > 256) & (x.square() + y.square() < 260)  # between two angles
+    assert torch.equal(common_field(rig, grid) & ~rim, field)
+
+
 @pytest.mark.parametrize("beam", ["cone", "parallel"])
 def test_a_fine_scan_takes_no_square_of_its_views(beam):
     """300 000 views: singular vectors of all views, 720 GB, were made and never used."""

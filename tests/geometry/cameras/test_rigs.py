@@ -6,7 +6,9 @@ from omegaconf import OmegaConf
 
 from mvrecon.apps.config import conf_dir, to_plain
 from mvrecon.core.parts import CAMERAS
-from mvrecon.geometry.cameras.rigs import Detector, arc, circular, dome, parallel
+from mvrecon.geometry.cameras.rigs import Detector, arc, circular, dome, parallel, sinogram_rig
+from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import euler_rotation
 from tests.geometry.cameras.rigs import DETECTOR, OPTIONS, same
 
 CENTRE = torch.tensor([4.0, 2.5], dtype=torch.float64)  # (u, v) of the middle of 6 x 9 pixels
@@ -220,3 +222,12 @@ def test_the_shipped_settings_see_a_ball_of_50_mm_about_the_origin(name):
     assert (uvz[..., :2] > -0.5).all() and (uvz[..., :2] < doubles(columns, rows) - 0.5).all()
     least, most = (w * cameras.distance[:, None] for w in cameras.ray_extent)
     assert (uvz[..., 2] > least).all() and (uvz[..., 2] < most).all()
+
+
+@pytest.mark.parametrize(("width", "height", "mm"), [(30, 40, 1.0), (60, 80, 0.1), (50, 120, 0.3)])
+def test_rounding_adds_no_column_to_the_diagonal_of_a_slice(width, height, mm):
+    """Of slices whose diagonal is a whole number of voxels, however the grid is turned."""
+    grid, columns = Grid.centred(size=(width, height, 2), spacing=mm), math.hypot(width, height)
+    for turn in range(0, 90, 7):
+        R = euler_rotation([float(turn), 20.0, -turn / 2])
+        assert sinogram_rig(grid.moved(R, torch.zeros(3)), 8).shape == (2, columns)

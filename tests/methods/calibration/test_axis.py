@@ -18,6 +18,13 @@ RADII = torch.tensor([40.0, 7, 9, 6, 4])[:, None].expand(-1, 3)
 VALUES = 0.01 * torch.tensor([1.0, 1, -0.8, 2, 3])
 RODS = Phantom((Solids("cylinder", CENTRES, torch.eye(3).expand(5, 3, 3), RADII, VALUES),))
 GRID = Grid.centred(size=(96, 96, 8), spacing=1.0)
+#: An ellipsoid in a part of the rows: centre, axes, semi-axes and value.
+TILTED = (
+    torch.tensor([[9.0, -20, 1.5]]),
+    torch.eye(3)[None],
+    torch.tensor([[6.0, 9, 1.5]]),
+    torch.tensor([0.02]),
+)
 
 
 def rig_of(beam, arc, aside, rows=1):
@@ -151,3 +158,22 @@ def test_the_root_of_the_ramp_is_symmetric_and_weighs_edges():
     rows[:, :, 1, :, 256:] = 0
     middle = RootRamp((2, 1, 512), 0.5, torch.device("cpu"))(rows)[0, 0, :, 0, 252:260]
     assert middle[0].abs().max() < 0.2 * middle[1].abs().max()
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_rounding_does_not_decide_the_slice(rows):
+    """As long as the fit takes an odd number of rows out of an even one, or voxels that hold an
+    even number of pixels.
+    """
+    rig, operator = rig_of("parallel", 360.0, False, rows), Radon
+    lean = Solids("ellipsoid", *TILTED)
+    shifted = rig.shifted(torch.tensor([[0.7, 0.0]]))
+    y = Phantom((*RODS.parts, lean)).integrals(*shifted.rays()).float()[None, None]
+    found = []
+    for nudge in (0.0, 1e-13, -1e-13):
+        affine = GRID.affine.clone()
+        affine[:3] *= 1 + nudge
+        moved = rig.moved(torch.eye(3), torch.tensor([0.0, 0.0, 20 * nudge]))
+        found += [refined_axis(operator, rig, y, Grid(GRID.shape, affine), 4.0).offset]
+        found += [refined_axis(operator, moved, y, GRID, 4.0).offset]
+    assert max(found) - min(found) < 1e-6

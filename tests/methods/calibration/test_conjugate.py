@@ -179,3 +179,15 @@ def test_the_axis_of_a_large_scan_comes_back():
     views = views_of(rig, object_of(3, 40.0), 17.4)
     axis = conjugate_axis(rig, views, GRID)
     assert abs(axis.offset - 17.4) < 2 * axis.uncertainty
+
+
+@pytest.mark.parametrize(("views", "arc"), [(190, 190.0), (188, 188.0), (270, 270.0), (200, 250.0)])
+def test_rounding_does_not_decide_which_rays_have_conjugates(views, arc):
+    """Of parallel beams, the first view has the conjugate of one half a turn later, or the last."""
+    rig = rig_of("parallel", arc, views=views)
+    y = views_of(rig, object_of(0, 40.0), 0.7)
+    found = [
+        conjugate_axis(rig_of("parallel", arc * (1 + nudge), views=views), y, GRID).offset
+        for nudge in (0.0, 1e-13, -1e-13, 1e-11, -1e-11)
+    ]
+    assert max(found) - min(found) < 1e-7

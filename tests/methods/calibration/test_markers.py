@@ -81,6 +81,19 @@ def test_a_blob_is_located_at_its_centroid():
     assert nothing[0, :2].isnan().all()
 
 
+@pytest.mark.parametrize("radius", [5.0, 6.0, 6.5, 10.0])
+def test_rounding_does_not_decide_which_pixels_are_a_blobs(radius):
+    """In the middle of a pixel, or of two."""
+    pixels = pixel_centres((41, 41))
+    for u in (20.0, 20.5):
+        guess = torch.tensor([[[u, 20.0]]], dtype=torch.float64)
+        found = []
+        for nudge in (0.0, 1e-13, -1e-13, 1e-11):
+            away = (pixels - guess[0] - nudge).norm(dim=-1)
+            found.append(centroids(torch.sigmoid((3 - away) / 0.3)[None], guess, radius)[0, 0])
+        assert (torch.stack(found) - found[0]).abs().max() < 1e-8
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_markers_in_parallel_beams_are_refused(noise):
     """A source far away is none of them: 10 m for markers of 60 mm."""

@@ -16,6 +16,10 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.solver import Common, declares
 from mvrecon.operators.operator import Derived, LinearOperator
+from mvrecon_spect.methods.priors import TIE
+
+#: Difference in f of a voxel that is beyond the grid or the support.
+ABSENT = 1e9
 
 
 def kernel_matrix(
@@ -29,7 +33,8 @@ def kernel_matrix(
     in rows that sum to one; f is the anatomy over its standard deviation.
 
     Neighbours are the voxels with the most similar f in a window of `reach` voxels to each side,
-    including i; ties are resolved by distance. Rows and columns outside the support are zero.
+    including i; of equally similar ones, up to rounding, the nearest, and all that are equally far.
+    Rows and columns outside the support are zero.
 
     The Gaussian, the scale of f, the nearest neighbours and the row sums follow Wang and Qi, see
     `kem`. Their features are composite frames of a dynamic scan, with neighbours from the entire
@@ -51,19 +56,30 @@ def kernel_matrix(
     padded = F.pad(f, [reach] * 6, value=torch.inf), F.pad(every, [reach] * 6)
     near, names = (p.unfold(0, side, 1).unfold(1, side, 1).unfold(2, side, 1) for p in padded)
     line = torch.arange(-reach, reach + 1, device=f.device).square().float()
-    far = (line[:, None, None] + line[:, None] + line).flatten() * 1e-6  # resolves ties
-    columns, weights = [], []
+    far = (line[:, None, None] + line[:, None] + line).flatten()
+    places, weights = [], []
     for own, values, numbers in zip(f, near, names, strict=True):  # in slices, to save memory
-        apart = (values.reshape(own.numel(), -1) - own.reshape(-1, 1)).square()
-        apart = torch.where(apart.isfinite(), apart, torch.inf)
-        chosen = (apart + far).topk(neighbours, dim=1, largest=False).indices
-        weight = torch.exp(apart.gather(1, chosen) / (-2 * width**2))
-        weights.append(weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-30))
-        columns.append(numbers.reshape(own.numel(), -1).gather(1, chosen))
-    rows = every.flatten().repeat_interleave(neighbours)
-    places, values = torch.stack([rows, torch.cat(columns).flatten()]), torch.cat(weights).flatten()
+        apart = (values.reshape(own.numel(), -1) - own.reshape(-1, 1)).abs()
+        apart = apart.nan_to_num(nan=ABSENT, posinf=ABSENT)
+        limit = _last(apart, neighbours)
+        rank = torch.where(apart < limit - TIE, -1.0, far)
+        rank = rank.masked_fill(apart > limit + TIE, torch.inf)
+        chosen = (rank <= _last(rank, neighbours)) & (apart < ABSENT)
+        weight = torch.exp(apart.square() / (-2 * width**2)) * chosen
+        weight = weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-30)
+        at = chosen.nonzero(as_tuple=True)
+        columns = numbers.reshape(own.numel(), -1)[at]
+        places.append(torch.stack([every[len(places)].flatten()[at[0]], columns]))
+        weights.append(weight[at])
     size = f.numel(), f.numel()
-    return torch.sparse_coo_tensor(places, values, size, check_invariants=False).coalesce()
+    return torch.sparse_coo_tensor(
+        torch.cat(places, dim=1), torch.cat(weights), size, check_invariants=False
+    ).coalesce()
+
+
+def _last(values: Float[Tensor, "n k"], count: int) -> Float[Tensor, "n 1"]:
+    """The greatest of the least so many values of each row."""
+    return values.topk(count, dim=1, largest=False).values.amax(dim=1, keepdim=True)
 
 
 class Kernelled(Derived):

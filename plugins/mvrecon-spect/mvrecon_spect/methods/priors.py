@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+#: Differences up to this part of an anatomy's range are rounding, and values apart by them equal.
+TIE = 1e-5
 #: Half of the 26 neighbours (z, y, x); the other half follows by symmetry.
 HALF = [offset for offset in product((-1, 0, 1), repeat=3) if offset > (0, 0, 0)]
 
@@ -244,7 +246,7 @@ def _reach(
         difference = (one - other).abs()
         ends(apart[n], offset)[0].copy_(difference)
         ends(apart[n + 13], offset)[1].copy_(difference)
-    return apart.kthvalue(similar, dim=0).values
+    return apart.kthvalue(similar, dim=0).values + TIE * (anatomy.amax() - anatomy.amin())
 
 
 def _chosen(

@@ -17,6 +17,9 @@ BINS = 4
 LEAST_VOXELS, ROUND = 8, 0.2
 #: Step of an edge, at least, in standard deviations of its profile away from the edge.
 LEAST_STEP = 5
+#: Voxels this near to the border of a bin, in its width, or of a cone are on its far side, which
+#: rounding would decide else.
+ROUNDING = 1e-6
 
 
 class Mtf(NamedTuple):
@@ -79,8 +82,8 @@ def ball_mtf(
             f"Expected a ball of {LEAST_VOXELS} voxels or more, got {diameter / pitch:.1f}"
         )
     distance = offset.norm(dim=-1)
-    near = (distance - radius).abs() < radius / 2
-    near &= (offset @ direction).abs() >= math.cos(math.radians(cone_degrees)) * distance
+    within = (math.cos(math.radians(cone_degrees)) - ROUNDING) * distance
+    near = (offset @ direction).abs() >= within
     profile = _profile(values[near], distance[near] - radius, pitch / BINS, radius / 2)
     return _transformed(profile, pitch / BINS, pitch)
 
@@ -113,7 +116,7 @@ def plane_mtf(
         )
     beyond = offset @ direction
     across = (offset - beyond[..., None] * direction).norm(dim=-1)
-    near = (across <= reach) & (beyond.abs() < reach)
+    near = across <= reach * (1 + ROUNDING)
     profile = _profile(values[near], beyond[near], pitch / BINS, reach)
     return _transformed(profile, pitch / BINS, pitch)
 
@@ -187,8 +190,8 @@ def _profile(
     values: Float[Tensor, " n"], beyond: Float[Tensor, " n"], width: float, reach: float
 ) -> Float[Tensor, " k"]:
     """Mean of the values in bins of distance from the surface."""
-    count = 2 * int(reach / width)
-    index = ((beyond / width).floor() + count // 2).long()
+    count = 2 * int(reach / width + ROUNDING)
+    index = ((beyond / width + ROUNDING).floor() + count // 2).long()
     inside = (index >= 0) & (index < count)
     number = torch.bincount(index[inside], minlength=count)
     if not bool((number > 0).all()):

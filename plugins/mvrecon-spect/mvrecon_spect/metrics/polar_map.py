@@ -82,7 +82,7 @@ def polar_map(
             f"{list(axis.apex)}"
         )
     origins, directions = _rays(axis, rows, angles)
-    count = 1 + math.ceil(reach_mm / (min(grid.spacing) / 2))
+    count = 1 + math.ceil(reach_mm / (min(grid.spacing) / 2) - 1e-6)
     depth = torch.linspace(0, reach_mm, count, dtype=torch.float64)
     points = origins[..., None, :] + directions[..., None, :] * depth[:, None]
     index = normalised(grid.to_index(points), grid.shape)

@@ -310,10 +310,11 @@ def parts_of(rig: Float[Tensor, "m c"], grid: Grid) -> tuple[int, int, int]:
     Only voxels with long edges are split, and only if their image at the grid's centre, with the
     hole's and a pixel, is oblique on the detector.
     """
-    edges = grid.spacing[::-1]
-    if max(edges) < LONG * min(edges):
+    # to six decimals, so that rounding decides no number
+    edges = [round(edge / min(grid.spacing), 6) for edge in grid.spacing[::-1]]
+    if max(edges) < LONG:
         return 1, 1, 1
-    z, y, x = (min(math.ceil(edge / min(edges) - 0.1), MOST_PARTS) for edge in edges)
+    z, y, x = (min(math.ceil(edge - 0.1), MOST_PARTS) for edge in edges)
     index = torch.cat([grid.centre_index, grid.centre_index.new_ones(1)])[None].to(rig)
     for record in rig:
         prints, w = reference.footprints(record, index), index @ record[reference.OF_W]

@@ -89,7 +89,7 @@ def _frustum(matter: Grid, camera: Cameras) -> _Frustum:
     source, length = camera.source[0], camera.distance[0]
     far, near = (-camera.depth_range(matter)[0]).unbind()
     near, voxel = near.clamp_min(0), PARTS * min(matter.spacing)
-    slabs = max(math.ceil((far - near).item() / (DEEP * voxel)), 1)
+    slabs = max(math.ceil((far - near).item() / (DEEP * voxel) - 1e-6), 1)
     corners = camera.project(matter.corners().to(source))[0]
     numbers, ends = [], []
     for axis, (pixels, pitch) in enumerate(
@@ -100,7 +100,7 @@ def _frustum(matter: Grid, camera: Cameras) -> _Frustum:
             first, last = corners[:, axis].aminmax()
             low, high = first.clamp(low, high - 1), last.clamp(low + 1, high)
         apart = APART * voxel * length / ((near + far) / 2 * pitch[0].norm())
-        numbers.append(min(max(math.ceil(((high - low) / apart).item()) + 1, FEWEST), MOST))
+        numbers.append(min(max(math.ceil(((high - low) / apart).item() - 1e-6) + 1, FEWEST), MOST))
         ends += [low, (high - low) / (numbers[-1] - 1)]
     beam = camera.origin[0] - source
     world = -torch.stack([camera.u[0], camera.v[0], beam], dim=1) / length

@@ -231,7 +231,21 @@ def test_the_weights_of_a_line_sum_to_one(name: str):
     assert torch.allclose(total + total.flip(0), torch.full_like(total, 2 * math.pi), rtol=1e-2)
 
 
-#: Scans whose weights rounding decided, by 2 % (a longer arc) to 28 % (a half turn) of the most.
+def helix(turns: int, views: int) -> Cameras:
+    rig = fan(FAN, [360.0 * turns * k / views for k in range(views)])
+    rise = torch.zeros(views, 3, dtype=torch.float64)
+    rise[:, 2] = torch.linspace(-8, 8, views)
+    return replace(rig, source=rig.source + rise, origin=rig.origin + rise)
+
+
+def both(one: Cameras, other: Cameras) -> Cameras:
+    """The views of one rig and then of another."""
+    tensors = ("source", "origin", "u", "v")
+    return replace(one, **{k: torch.cat([getattr(one, k), getattr(other, k)]) for k in tensors})
+
+
+#: Scans whose weights rounding or the order of the views decided, by 0.01 % (two panels), 0.1 % (a
+#: helix), 1 % (210 degrees) to 30 % (exposures, a half turn) of the most.
 TIES = {
     "half turn of 8 parallel views": beam(LINE, [22.5 * k for k in range(8)]),
     "half turn of 80 parallel views": beam(LINE, [2.25 * k for k in range(80)]),
@@ -241,21 +255,28 @@ TIES = {
     "270 degrees": fan(FAN, [4.5 * k for k in range(61)]),
     "200 degrees": fan(FAN, [200 / 239 * k for k in range(240)]),
     "199 degrees": fan(FAN, [float(k) for k in range(200)]),
+    "210 degrees": fan(FAN, [2.1 * k for k in range(100)]),
+    "exposures a fifth of a step apart": fan(FAN, TURN[::4] + [0.8 * k for k in range(1, 5)]),
+    "two panels": both(fan(HALF_FAN, TURN[::3]), fan(OTHER_HALF, TURN[::3])),
+    "three turns of a helix": helix(3, 120),
 }
 
 
 @pytest.mark.parametrize("name", TIES)
 @pytest.mark.filterwarnings("ignore:.*lines through the grid's inscribed cylinder")
 def test_rounding_does_not_decide_weights(name: str):
-    """Of views at even angles, in any order, whose panels are equal up to rounding."""
+    """Of views at even angles, in any order, whose panels are equal up to rounding. Also tried: 90
+    more scans, with gaps, clusters, repeated views, half panels and two panels of other widths.
+    """
     rig, generator = TIES[name], torch.Generator().manual_seed(0)
     weights = redundancy_weights(rig, SLICE, 1.0).weights.expand(-1, 257)
     if rig.parallel:
         torch.testing.assert_close(weights, torch.full_like(weights, math.pi / len(rig)))
     order = torch.randperm(len(rig), generator=generator)
     for moved in (1e-13, 1e-12, 1e-10):
-        noise = torch.randn(len(rig), 3, generator=generator, dtype=torch.float64)
-        near = replace(rig, origin=rig.origin + moved * rig.source.norm(dim=1).max() * noise)
+        noise = torch.randn(2, len(rig), 3, generator=generator, dtype=torch.float64)
+        source, origin = moved * rig.source.norm(dim=1).max() * noise
+        near = replace(rig, source=rig.source + source, origin=rig.origin + origin)
         found = redundancy_weights(near[order], SLICE, 1.0).weights.expand(-1, 257)
         torch.testing.assert_close(found, weights[order], rtol=1e-6, atol=1e-6 * weights.max())
 
