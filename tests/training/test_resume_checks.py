@@ -68,8 +68,10 @@ def test_settings_that_were_edited_in_a_stopped_run_are_refused(place, value, st
 
 
 def test_settings_of_the_machine_may_change_in_a_stopped_run(stopped):
+    """And where the data are, whose digests are compared."""
     folder, last = stopped
     for place, value in (
+        ("scene.path", "/elsewhere/train.h5"),
         ("data.workers", 2),
         ("data.cache", "/cases"),
         ("trainer.accelerator", "gpu"),
