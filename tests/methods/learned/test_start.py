@@ -105,7 +105,7 @@ METHODS_OF_CASES = {
 
 @pytest.fixture
 def few_iterations(monkeypatch):
-    """Of an alignment, which takes nearly all of the time: which case it is does not depend on them."""
+    """Of an alignment, which take nearly all of the time; the case does not depend on them."""
     monkeypatch.setattr(self_alignment, "ITERATIONS_FROM_ZERO", 3)
 
 
