@@ -27,7 +27,7 @@ TWO = ("trainer.devices=2", "trainer.strategy=ddp", "data.batch_size=1")
 def app(*options, **environment):
     """`mvrecon-train` in a process of its own, as a user calls it."""
     command = [sys.executable, "-m", "mvrecon.apps.train", *options, "hydra/job_logging=none"]
-    settings = {**os.environ, "OMP_NUM_THREADS": "1", **environment}
+    settings = {**os.environ, "OMP_NUM_THREADS": "2", **environment}
     root = Path(__file__).parents[2]
     return subprocess.run(
         command, cwd=root, env=settings, capture_output=True, text=True, check=False
