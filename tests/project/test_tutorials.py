@@ -12,7 +12,11 @@ import pytest
 from scripts.docs import site_pages, tutorials
 
 #: Of repetitions that take long, the test runs a few.
-FEWER = {"register": ("for _ in range(8):", "for _ in range(2):")}
+FEWER = {
+    "register": ("for _ in range(8):", "for _ in range(2):"),
+    "own_plugin": ("steps=50", "steps=35"),
+    "own_training": ("steps, batch = 100, 4", "steps, batch = 50, 4"),
+}
 
 
 def notebook(file: Path) -> list[dict[str, Any]]:

@@ -9,6 +9,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from mvrecon.apps.config import compose
+from mvrecon.methods.calibration import self_alignment
 from mvrecon.methods.method import Alignment
 from mvrecon.training import fit
 from mvrecon.training.module import ReconstructionModule
@@ -34,12 +35,16 @@ def validated(module, cases, batch_size):
 
 @pytest.fixture(scope="module")
 def validation():
-    """A method that estimates its error and the shifts and gains of cameras, and three cases."""
+    """A method that estimates its error and the shifts and gains of cameras, and three cases; few
+    iterations of its alignment, which took nearly all of the time.
+    """
     torch.manual_seed(0)
     settings = TrainSettings(**compose(*ALIGNED))
     data = fit.build_data(settings)
     data.setup("validate")
-    return fit.build_module(settings, settings.method, data.data_range), data.sets["val"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(self_alignment, "ITERATIONS_FROM_ZERO", 3)
+        yield fit.build_module(settings, settings.method, data.data_range), data.sets["val"]
 
 
 def test_no_figure_depends_on_the_batch_size(validation):

@@ -9,6 +9,7 @@ import torch
 
 from mvrecon.core.parts import METHODS
 from mvrecon.geometry.grid import Grid
+from mvrecon.methods.calibration import self_alignment
 from mvrecon.methods.classical.sirt import sirt
 from mvrecon.methods.learned import start as starts
 from mvrecon.methods.learned.geometry import Geometry
@@ -102,9 +103,15 @@ METHODS_OF_CASES = {
 }
 
 
+@pytest.fixture
+def few_iterations(monkeypatch):
+    """Of an alignment, which take nearly all of the time; the case does not depend on them."""
+    monkeypatch.setattr(self_alignment, "ITERATIONS_FROM_ZERO", 3)
+
+
 @pytest.mark.parametrize("name", METHODS_OF_CASES)
 @torch.no_grad()
-def test_the_result_of_a_case_is_that_of_its_operator(name):
+def test_the_result_of_a_case_is_that_of_its_operator(name, few_iterations):
     """Equal views with another rig, grid, pixel, method, number of rays, support, weight, or with
     one of them modified in place, by assignment or by other options; in one batch and in turn.
     """
@@ -127,7 +134,7 @@ def test_the_result_of_a_case_is_that_of_its_operator(name):
 
 @pytest.mark.parametrize("name", METHODS_OF_CASES)
 @torch.no_grad()
-def test_a_batch_of_cached_and_new_cases_with_operators_of_their_own(name):
+def test_a_batch_of_cached_and_new_cases_with_operators_of_their_own(name, few_iterations):
     grid, rig = small_rig()
     ramp = torch.linspace(0.5, 1.5, 12)
     each = [Scaled(RayTransform(grid, rig), ramp**power) for power in (0, 1, 2)]

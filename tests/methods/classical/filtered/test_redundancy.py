@@ -108,7 +108,7 @@ SCANS = {
     "two half turns": shifted(detector(90, 2.0), [20.0] * 180 + [35.0] * 180),
     "ramp": shifted(detector(90, 2.0), torch.linspace(10, 60, 360)),
     "displaced arc": fan(detector(120, 2.0, 20.0), TURN[:255]),
-    "dense and sparse": fan(HALF_FAN, TURN[:180:2] + [180 + k / 10 for k in range(1800)]),
+    "dense and sparse": fan(HALF_FAN, TURN[:180:2] + [180 + k / 5 for k in range(900)]),
     "ten exposures": fan(HALF_FAN, [3 * k + 0.1 * j for k in range(120) for j in range(10)]),
     "one pixel of overlap": fan(detector(66, 2.0, 64.0), TURN),
     **{
