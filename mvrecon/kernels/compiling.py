@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from numba import config, extending, njit
-from numba.core.caching import FunctionCache, NullCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.codegen import get_host_cpu_features
 
 #: numba's decorator of functions that generate LLVM's code; typed so that their callers may leave
@@ -64,6 +64,34 @@ def digest(folder: Path) -> str:
 SOURCES = digest(Path(__file__).parent)
 
 
+class CodeFiles(IndexDataCacheFile):
+    """Files of a loop's machine code, named by all that determines it.
+
+    The index of numba's own files names a file before it is written, and two processes may give one
+    name to two types of number: after a kill, or a race, a type would get the code of another.
+    """
+
+    def __init__(self, folder: str, loop: str, sources: str):
+        super().__init__(folder, loop, sources)
+        self._all, self._stem = f"{loop}.*", f"{loop}.{sha256(sources.encode()).hexdigest()[:16]}"
+
+    def load(self, key: Any) -> Any:
+        """The machine code of a key; None if there is none."""
+        with suppress(FileNotFoundError):
+            return self._load_data(self._name(key))
+        return None
+
+    def save(self, key: Any, data: Any) -> None:
+        """Write the machine code of a key, and delete that of other sources."""
+        self._save_data(self._name(key), data)
+        for file in Path(self._cache_path).glob(self._all):
+            if not file.name.startswith(self._stem):
+                file.unlink(missing_ok=True)
+
+    def _name(self, key: Any) -> str:
+        return f"{self._stem}.{sha256(repr((self._version, key)).encode()).hexdigest()[:16]}.nbc"
+
+
 class Kept(FunctionCache):
     """numba's cache of machine code, whose failures cost only time: unreadable code is
     recompiled.
@@ -79,7 +107,8 @@ class Kept(FunctionCache):
         Kept.folders.add(self.cache_path)
         # numba's own stamp covers the loop's file, but not functions that it calls, here or in a
         # plugin
-        self._cache_file._source_stamp = SOURCES + digest(Path(loop.__code__.co_filename).parent)
+        sources = SOURCES + digest(Path(loop.__code__.co_filename).parent)
+        self._cache_file = CodeFiles(self.cache_path, self._impl.filename_base, sources)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The machine code on disk; None to compile, which is reported once."""
@@ -100,19 +129,15 @@ class Kept(FunctionCache):
         try:
             return act(*arguments)
         except Exception as problem:  # damaged pickles raise anything
-            index = Path(self._cache_file._index_path)
             if not Kept.warned:
                 Kept.warned = True
-                why = f"{type(problem).__name__}: {problem}"
                 logger.warning(
-                    "Compiled kernels in %s cannot be used or kept, so they are made anew: %s; "
+                    "Compiled kernels in %s cannot be used or kept, so they are made anew: %s: %s; "
                     "NUMBA_CACHE_DIR=<folder> keeps them elsewhere",
-                    index,
-                    why,
+                    self.cache_path,
+                    type(problem).__name__,
+                    problem,
                 )
-            # it may be damaged, or name an older file that could not be overwritten
-            with suppress(OSError):
-                index.unlink(missing_ok=True)
             return None
 
 

@@ -29,6 +29,16 @@ class WholeSteps(_TrainingEpochLoop):
         for counts in (progress.total, progress.current):
             counts.ready = counts.started = counts.processed + 1
 
+    def _should_check_val_epoch(self) -> bool:
+        """Whether the epoch of the last batch is validated. In a training that stopped after the
+        last batch of an epoch, Lightning has counted that epoch, and no batch of the next one.
+        """
+        every = self.trainer.check_val_every_n_epoch
+        stopped = self.restarting and self.restarted_on_train_batch_end
+        if every is None or not stopped or self.batch_progress.current.ready:
+            return super()._should_check_val_epoch()
+        return self.trainer.enable_validation and self.trainer.current_epoch % every == 0
+
     def advance(self, data_fetcher: Any) -> None:
         """Train on a batch; a training that stopped at the end of an epoch resumes after it, and
         one that stopped before or in a validation with that, which Lightning leaves out.

@@ -81,17 +81,52 @@ def total(run, code: Path) -> float:
     return total
 
 
-@pytest.mark.parametrize("ending", ["nbi", "nbc"])
-def test_damaged_machine_code_files_are_rewritten(ending, run, total, code):
-    """A truncated or foreign index or file of compiled kernels causes a recompilation and a
-    warning, and is rewritten.
+def test_damaged_machine_code_files_are_rewritten(run, total, code):
+    """A truncated or foreign file of compiled kernels causes a recompilation and a warning, and is
+    rewritten.
     """
-    one, other = sorted(code.rglob(f"*.{ending}"))
+    one, other = sorted(code.rglob("*.nbc"))
     one.write_bytes(one.read_bytes()[: one.stat().st_size // 2])
     other.write_bytes(b"\x80\x04 of another kind")
     again, anew, warned = run(code)
     assert (again, anew, len(warned)) == (total, 2, 1)
     assert run(code) == (total, 0, [])
+
+
+def test_a_killed_process_leaves_no_type_the_code_of_another(tmp_path, monkeypatch):
+    """Of sources that have changed: numba's own files name a file in the index before it is
+    written, and the name is that of older code, perhaps for another type.
+    """
+    older, newer = (compiling.CodeFiles(str(tmp_path), "loop", name) for name in ("older", "newer"))
+    older.save("float64", "older code")
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as kill, pytest.raises(KeyboardInterrupt):
+        kill.setattr(newer, "_save_data", killed)
+        newer.save("float32", "code")
+    assert newer.load("float32") is newer.load("float64") is None
+    newer.save("float32", "code")
+    assert newer.load("float32") == "code" and newer.load("float64") is None
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_two_processes_that_compile_at_once_keep_both_types(tmp_path, monkeypatch):
+    """Each has looked for files before the other writes its own."""
+    one, other = (compiling.CodeFiles(str(tmp_path), "loop", "these") for _ in range(2))
+    write = one._save_data
+
+    def meanwhile(*arguments):
+        other.save("float64", "code of float64")
+        write(*arguments)
+
+    monkeypatch.setattr(one, "_save_data", meanwhile)
+    one.save("float32", "code of float32")
+    assert [other.load(key) for key in ("float32", "float64")] == [
+        "code of float32",
+        "code of float64",
+    ]
 
 
 @pytest.mark.parametrize("limit", [64, 2000])
@@ -101,7 +136,6 @@ def test_a_full_disk_leaves_no_machine_code_and_the_same_volume(limit, run, tota
     """
     again, anew, warned = run(code, "newer", limit)
     assert (again, anew, len(warned)) == (total, 2, 1) and "OSError" in warned[0]
-    assert not list(code.rglob("*.nbi"))
     assert run(code, "newer") == (total, 2, []) and run(code, "newer") == (total, 0, [])
 
 

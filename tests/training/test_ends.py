@@ -130,13 +130,21 @@ def test_a_run_broken_in_epoch_after_epoch_resumes_exactly(whole, tmp_path):
     assert same(tmp_path / "run", expected) and logged(tmp_path / "run") == logged(expected)
 
 
-def test_a_first_validation_that_is_interrupted_is_repeated(tmp_path):
+@pytest.mark.parametrize(
+    "broken_in",
+    [
+        ("validation_step", 1),
+        ("training_step", 5, lives.signalled(signal.SIGTERM), SystemExit),
+        ("training_step", 10, lives.signalled(signal.SIGTERM), SystemExit),
+    ],
+)
+def test_only_validated_epochs_are_validated_whatever_is_interrupted(broken_in, tmp_path):
     """Validated every other epoch: the checkpoint at the end of a validated epoch is that after its
-    validation.
+    validation. Also stopped by a signal in the last step of either epoch.
     """
     options = ("+trainer.check_val_every_n_epoch=2", "trainer.val_check_interval=1.0")
     settings = begun(tmp_path / "run", f"trainer.max_steps={STEPS}", *options)
-    broken(settings, tmp_path / "run", "validation_step", 1)
+    broken(settings, tmp_path / "run", *broken_in)
     train(settings, tmp_path / "run")
     with open(tmp_path / "run" / "metrics.csv", newline="") as file:
         assert [row["step"] for row in csv.DictReader(file) if row["val/psnr"]] == ["9"]

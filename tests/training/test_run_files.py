@@ -70,7 +70,7 @@ def test_the_version_of_torch_includes_its_build(monkeypatch):
 
 
 def test_versions_of_other_distributions_are_listed_after_those_of_mvrecon():
-    own, found = run_folder.versions(), run_folder.versions("pytest", "no-such-thing")
+    own, found = run_folder.versions(), run_folder.versions(others=("pytest", "no-such-thing"))
     assert found == own | {"pytest": pytest.__version__, "no-such-thing": "not installed"}
 
 
