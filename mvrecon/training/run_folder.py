@@ -147,7 +147,7 @@ def compare_versions(folder: Path, settings: Mapping[str, Any]) -> None:
         return
     lines = text_of(folder / VERSIONS).splitlines()
     before = {name: version for name, _, version in (line.partition(" ") for line in lines)}
-    now = versions(registry.names(settings.get("plugins")))
+    now = versions(settings.get("plugins"))
     changed = [
         f"{name} {before[name]} became {version}"
         for name, version in now.items()
@@ -155,15 +155,16 @@ def compare_versions(folder: Path, settings: Mapping[str, Any]) -> None:
     ]
     if changed:
         warnings.warn(
-            f"{folder} began with other versions: {'; '.join(changed)}. What is there already "
-            f"stays as it is",
+            f"{folder} began with other versions: {'; '.join(changed)}. Its existing results "
+            f"are kept",
             stacklevel=3,
         )
 
 
-def versions(plugins: Iterable[str] = (), others: Iterable[str] = ()) -> dict[str, str]:
+def versions(plugins: Any = None, others: Iterable[str] = ()) -> dict[str, str]:
     """Versions of Python, of mvrecon, of its numerical dependencies, of installed plugins and of
-    other distributions, and digests of the code of the modules `plugins`, which are imported.
+    other distributions, and digests of the code of the modules that the setting `plugins` names,
+    which are imported.
 
     Torch's own version includes the build (2.13.0+cu130), which the package index omits.
     """
@@ -183,13 +184,14 @@ def versions(plugins: Iterable[str] = (), others: Iterable[str] = ()) -> dict[st
     packages |= {
         point.dist.name: point.dist.version for point in registry.installed() if point.dist
     }
-    return packages | {name: f"sha256:{code}" for name, code in digests.of_code(plugins).items()}
+    names = registry.names(plugins)
+    return packages | {name: f"sha256:{code}" for name, code in digests.of_code(names).items()}
 
 
 def start(folder: Path, settings: Mapping[str, Any], file: str = SETTINGS) -> None:
     """Write a run's settings, plain and resolved, and the versions."""
     write_text(folder / file, yaml.safe_dump(dict(settings), sort_keys=False))
-    lines = versions(registry.names(settings.get("plugins"))).items()
+    lines = versions(settings.get("plugins")).items()
     write_text(folder / VERSIONS, "".join(f"{name} {version}\n" for name, version in lines))
 
 

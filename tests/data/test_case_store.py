@@ -178,56 +178,7 @@ def test_cases_of_values_beside_their_header_are_regenerated_when_these_change(t
     assert truth(1000.0) > 1.5 * truth(0.0)
 
 
-@pytest.mark.parametrize(("package", "factory"), [(False, False), (True, False), (False, True)])
-def test_an_edited_scene_of_a_plugin_is_computed_anew(package, factory, tmp_path, monkeypatch):
-    """A module of its own, another file of its package than the one of the scene, or a function
-    that returns a scene of mvrecon.
-    """
-    name = f"edited_{package}_{factory}"
-    home = tmp_path / name if package else tmp_path
-    home.mkdir(exist_ok=True)
-    value = home / "value.py" if package else tmp_path / f"{name}.py"
-    scene = (
-        "from mvrecon.core.parts import SCENES\n"
-        "from mvrecon.data.scenes.sample import Scene\n"
-        "class Mine(Scene):\n"
-        "    data_range, unit = 0.02, '1/mm'\n"
-        "    def sample(self, *case):\n"
-        "        return SCENES.build('ellipsoids', value=VALUE).sample(*case)\n"
-    )
-    if factory:
-        scene = (
-            "from mvrecon.core.parts import SCENES\n"
-            "def Mine():\n"
-            "    return SCENES.build('ellipsoids', value=VALUE)\n"
-        )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-
-    def truth(number):
-        value.write_text(f"VALUE = {number}\n" + ("" if package else scene))
-        if package:
-            (home / "__init__.py").write_text(f"from {name}.value import VALUE\n" + scene)
-        for module in [key for key in sys.modules if key.partition(".")[0] == name]:
-            del sys.modules[module]
-        importlib.invalidate_caches()
-        monkeypatch.setitem(SCENES._parts, name, importlib.import_module(name).Mine)
-        data = SceneData(
-            dict.fromkeys(("train", "test"), {"name": name}),
-            {"grid": {"shape": [8, 8, 8], "spacing": 6.0}, "camera": RIG},
-            {"train": 1, "val": 1, "test": 1},
-            cache=str(tmp_path / "cases"),
-        )
-        data.setup("test")
-        return data.sets["test"].prepare()["volume"].max().item()
-
-    first = truth(0.01)
-    assert truth(0.02) == pytest.approx(2 * first) and truth(0.01) == first
-    assert len(list((tmp_path / "cases").iterdir())) == 2
-
-
-#: Where the value of an edited scene is written, by what the scene is: files, with that of the
-#: value last, and the options of the scene.
+#: A plugin's scene, whose value is edited, and the plugin's files by where the value is written.
 CLASS = (
     "from mvrecon.core.parts import SCENES\n"
     "from mvrecon.data.scenes.sample import Scene\n"
@@ -238,6 +189,21 @@ CLASS = (
 )
 LATER = "\n@SCENES.register('{name}')\nclass Mine(Base): pass\n"
 EDITED = {
+    "own module": {
+        "{name}.py": "VALUE = {value}\n" + CLASS.format(base="Base") + LATER,
+    },
+    "another file of its package": {
+        "{name}/value.py": "VALUE = {value}\n",
+        "{name}/__init__.py": "from {name}.value import VALUE\n"
+        + CLASS.format(base="Base")
+        + LATER,
+    },
+    "function that returns a scene of mvrecon": {
+        "{name}.py": "from mvrecon.core.parts import SCENES\nVALUE = {value}\n"
+        "@SCENES.register('{name}')\n"
+        "def mine():\n"
+        "    return SCENES.build('ellipsoids', value=VALUE)\n",
+    },
     "base class elsewhere": {
         "{name}.py": "from mvrecon.core.parts import SCENES\nfrom {name}_base import Base" + LATER,
         "{name}_base.py": "VALUE = {value}\n" + CLASS.format(base="Base"),

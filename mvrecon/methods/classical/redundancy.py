@@ -404,7 +404,7 @@ def _raster(views: int, usual: float) -> int:
 
 def _start(orbit: Orbit) -> float:
     """The angle behind the widest gap, in radians from the first view; of several as wide the first
-    one from a direction in the world, so that results do not depend on the order of the views.
+    one after a fixed direction, so that results do not depend on the order of the views.
     """
     aside = orbit.axis.new_tensor(ASIDE)
     zero = torch.atan2(orbit.tangents[0] @ aside, orbit.outwards[0] @ aside)

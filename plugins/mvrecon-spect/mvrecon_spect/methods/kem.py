@@ -58,7 +58,9 @@ def kernel_matrix(
     line = torch.arange(-reach, reach + 1, device=f.device).square().float()
     far = (line[:, None, None] + line[:, None] + line).flatten()
     places, weights = [], []
-    for own, values, numbers in zip(f, near, names, strict=True):  # in slices, to save memory
+    for own, rows, values, numbers in zip(
+        f, every, near, names, strict=True
+    ):  # in slices, to save memory
         apart = (values.reshape(own.numel(), -1) - own.reshape(-1, 1)).abs()
         apart = apart.nan_to_num(nan=ABSENT, posinf=ABSENT)
         limit = _last(apart, neighbours)
@@ -69,7 +71,7 @@ def kernel_matrix(
         weight = weight / weight.sum(dim=1, keepdim=True).clamp_min(1e-30)
         at = chosen.nonzero(as_tuple=True)
         columns = numbers.reshape(own.numel(), -1)[at]
-        places.append(torch.stack([every[len(places)].flatten()[at[0]], columns]))
+        places.append(torch.stack([rows.flatten()[at[0]], columns]))
         weights.append(weight[at])
     size = f.numel(), f.numel()
     return torch.sparse_coo_tensor(
