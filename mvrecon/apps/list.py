@@ -20,9 +20,8 @@ from pathlib import Path
 
 from mvrecon.apps.command_line import command_line
 from mvrecon.apps.settings import SECTIONS
-from mvrecon.core.parts import LISTED, METRICS
+from mvrecon.core.parts import LISTED, METRICS, Part, describe, describe_section
 from mvrecon.core.registry import hint, import_plugins
-from mvrecon.core.signatures import Part, describe, describe_section
 
 #: The project; `my_plugin` in paths and texts stands for its name, and files end in `.txt`, so that
 #: nothing takes them for mvrecon's own.

@@ -18,9 +18,8 @@ from mvrecon.apps.config.errors import PROGRAM_FAULTS, USER_ERRORS, one_line, se
 from mvrecon.apps.config.guard import as_typed
 from mvrecon.apps.settings import ReconstructSettings, complete
 from mvrecon.core.options import with_paths
-from mvrecon.core.parts import CameraPart
+from mvrecon.core.parts import CameraPart, describe
 from mvrecon.core.registry import import_plugins
-from mvrecon.core.signatures import describe
 
 if TYPE_CHECKING:
     from mvrecon.apps.correction import Corrections

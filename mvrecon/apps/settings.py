@@ -15,13 +15,12 @@ from mvrecon.core.parts import (
     FactorsPart,
     MethodPart,
     Options,
-    OptionsOf,
-    PartOf,
     ProjectorPart,
     ScatterPart,
     ScenePart,
 )
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt, WeightsFile
+from mvrecon.core.signatures import OptionsOf, PartOf
 from mvrecon.training.settings import (
     MISSING,
     AcquisitionOptions,

@@ -15,14 +15,17 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from mvrecon.core.files.checks import shown
-from mvrecon.core.parts import LISTED, REGISTRIES, TARGET_KEY, NamesOf, Options, OptionsOf, PartOf
+from mvrecon.core.parts import LISTED, REGISTRIES, Options, describe
 from mvrecon.core.quantities import NonNegativeFloat
 from mvrecon.core.registry import check_options, hint
 from mvrecon.core.signatures import (
     REQUIRED,
+    TARGET_KEY,
+    NamesOf,
     Option,
+    OptionsOf,
+    PartOf,
     alternatives,
-    describe,
     in_words,
     is_record,
     items,

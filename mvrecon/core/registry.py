@@ -23,6 +23,7 @@ from pkgutil import resolve_name
 from typing import Any
 
 from mvrecon.core.files.checks import shown
+from mvrecon.core.signatures import options_of
 
 GROUP = "mvrecon.plugins"
 #: Registrations in order: the table, the name, and its previous value.
@@ -160,7 +161,7 @@ class Registry:
     def _accepting(self, name: str, options: Iterable[str]) -> Callable[..., Any]:
         """Return a part, checking that it has these options."""
         part = self.get(name)
-        known, others = _options_of(part)
+        known, others = options_of(part)
         if not others:
             check_options(f"The {self.kind} {name!r}", options, known)
         return part
@@ -171,7 +172,7 @@ class Registry:
         Raises:
             LookupError: the name is unknown.
         """
-        return option in _options_of(self.get(name))[0]
+        return option in options_of(self.get(name))[0]
 
     def check(self, config: Mapping[str, Any]) -> None:
         """Check the mapping of `from_config` without building the part.
@@ -246,12 +247,6 @@ def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
     choices = list(known)
     if value not in choices:
         raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
-
-
-def _options_of(part: Callable[..., Any]) -> tuple[Mapping[str, Any], bool]:
-    from mvrecon.core.signatures import options_of  # which imports this file
-
-    return options_of(part)
 
 
 def _where(part: Any) -> str:

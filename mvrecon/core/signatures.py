@@ -1,12 +1,12 @@
-"""Parts and sections of settings as signatures, type hints and docstrings describe them; types in a
-YAML user's terms.
+"""Options of functions and classes as signatures, type hints and docstrings describe them; types in
+a YAML user's terms.
 """
 
 import inspect
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from inspect import Parameter
 from pathlib import Path
 from pkgutil import resolve_name
@@ -25,14 +25,64 @@ from typing import (
 
 from annotated_types import Ge, Gt, Len
 
-from mvrecon.core.parts import LISTED, OptionsOf, PartOf
-from mvrecon.core.registry import installed
-
 #: Types of plain data.
 PLAIN_TYPES = (int, float, str, bool, Path, dict, list, tuple, Any)
 CONTAINER_TYPES = (Literal, Sequence, Mapping, list, tuple, dict)
 #: An option without a default.
 REQUIRED = Parameter.empty
+
+
+#: Names a class of Lightning's or mvrecon's in the place of a part's name.
+TARGET_KEY = "_target_"
+
+
+@dataclass(frozen=True)
+class PartOf:
+    """Marks the type of a mapping of a part's name and options.
+
+    Args:
+        kind: kind of the part.
+        also: "module:name" of further options, which are not the part's own.
+        classical: whether only classical methods are allowed: functions, without weights.
+        partial: options without a name change those of a part that the app knows.
+        targets: "module:name" of f(target) -> the class of a `_target_`, which may take the place
+            of a name.
+        supplied: keywords that mvrecon gives itself.
+    """
+
+    kind: str
+    also: str = ""
+    classical: bool = False
+    partial: bool = False
+    targets: str = ""
+    supplied: tuple[str, ...] = ()
+
+    def key_in(self, node: Mapping[str, object]) -> str:
+        """The key of a mapping that says which part it is."""
+        return TARGET_KEY if self.targets and TARGET_KEY in node else "name"
+
+
+@dataclass(frozen=True)
+class NamesOf:
+    """Marks the type of a mapping whose keys are names of parts, and whose values are numbers.
+
+    Args:
+        kind: kind of the parts.
+    """
+
+    kind: str
+
+
+class OptionsOf:
+    """Marks the type of a mapping of the keywords of functions, classes or TypedDicts.
+
+    Args:
+        owners: "module:name" of each; of an option of two the first one's type counts.
+        passed: number of their leading arguments that are no options.
+    """
+
+    def __init__(self, *owners: str, passed: int = 0):
+        self.owners, self.passed = owners, passed
 
 
 @dataclass(frozen=True)
@@ -50,54 +100,6 @@ class Option:
         given = f"={default_in_words(self.default)}"
         value = f" ({in_words(self.type) or 'needed'})" if self.default is REQUIRED else given
         return f"{name}{value}  {self.text}".rstrip()
-
-
-@dataclass(frozen=True)
-class Part:
-    """Description of one part: `catch_all` allows further options, `is_class` distinguishes classes
-    from functions; `error` is the reason why it cannot be imported.
-    """
-
-    kind: str
-    name: str
-    origin: str
-    summary: str = ""
-    options: Mapping[str, Option] = field(default_factory=dict)
-    catch_all: bool = False
-    is_class: bool = False
-    error: str = ""
-
-
-def describe(kind: str, name: str) -> Part:
-    """Import one part and describe it; `error` if it has no such name or does not import."""
-    registry, origin = LISTED[kind], ""
-    try:
-        origin = registry.origin(name)
-        owner = registry.get(name)
-    except (LookupError, ImportError) as error:
-        return Part(kind, name, origin, error=str(error))
-    is_class = inspect.isclass(owner)
-    # a method's class is built from its options, and called with what a function is passed
-    passed = 0 if kind == "method" and is_class else registry.passed
-    options, catch_all = options_of(owner, passed)
-    for point in installed():
-        if point.name == f"{kind}.{name}" and point.dist is not None:
-            origin += f" ({point.dist.name} {point.dist.version})"
-    return Part(kind, name, origin, _summary(owner), options, catch_all, is_class)
-
-
-def required(kind: str, name: str) -> list[str]:
-    """The options of a part that have no default, such as the path of a file."""
-    return [key for key, o in describe(kind, name).options.items() if o.default is REQUIRED]
-
-
-def describe_section(name: str, type: Any) -> Part:
-    """Describe a section of settings by its type, as a part of the kind "setting"."""
-    ((_, metadata),) = alternatives(type)
-    (section,) = [mark for mark in metadata if isinstance(mark, OptionsOf)]
-    options, _ = options_of_section(section)
-    summary = f"The options of `{name}.` in a configuration."
-    return Part("setting", name, section.owners[0], summary, options)
 
 
 def options_of(owner: Callable[..., Any], passed: int = 0) -> tuple[dict[str, Option], bool]:
@@ -155,10 +157,6 @@ def options_of_section(section: OptionsOf) -> tuple[dict[str, Option], bool]:
     found = [options_of(resolve_name(owner), section.passed) for owner in section.owners]
     options = {k: option for each, _ in reversed(found) for k, option in each.items()}
     return options, any(others for _, others in found)
-
-
-def _summary(owner: Any) -> str:
-    return " ".join((inspect.cleandoc(owner.__doc__ or "")).partition("\n\n")[0].split())
 
 
 def _texts(docstring: str | None) -> dict[str, str]:

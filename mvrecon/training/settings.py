@@ -12,16 +12,9 @@ from typing import Annotated, Any, TypeAlias
 
 from mvrecon.core.files.checks import plain_name
 from mvrecon.core.machine import Device
-from mvrecon.core.parts import (
-    CameraPart,
-    NamesOf,
-    Options,
-    OptionsOf,
-    PartOf,
-    ProjectorPart,
-    ScenePart,
-)
+from mvrecon.core.parts import CameraPart, Options, ProjectorPart, ScenePart
 from mvrecon.core.quantities import NonNegativeInt, WeightsFile
+from mvrecon.core.signatures import NamesOf, OptionsOf, PartOf
 
 GridOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.geometry.grid:Grid.centred")]
 AcquisitionOptions: TypeAlias = Annotated[

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import mvrecon
 from mvrecon.apps.list import listed
-from mvrecon.core.signatures import REQUIRED, Part, default_in_words, in_words
+from mvrecon.core.parts import Part
+from mvrecon.core.signatures import REQUIRED, default_in_words, in_words
 
 FOLDER = "reference/"
 PACKAGE = Path(mvrecon.__file__).parent

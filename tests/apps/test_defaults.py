@@ -20,8 +20,8 @@ from mvrecon.apps.config import compose, trusted_folders
 from mvrecon.apps.reconstruct import rig_of_scan
 from mvrecon.apps.settings import SECTIONS
 from mvrecon.apps.stated_rig import completed
-from mvrecon.core.parts import CAMERAS, REGISTRIES
-from mvrecon.core.signatures import REQUIRED, Option, describe, describe_section
+from mvrecon.core.parts import CAMERAS, REGISTRIES, describe, describe_section
+from mvrecon.core.signatures import REQUIRED, Option
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.geometry.cameras.rigs import Detector, circular
 

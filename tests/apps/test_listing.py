@@ -10,8 +10,8 @@ import pytest
 
 from mvrecon.apps.list import SETTING, listed, main
 from mvrecon.core import registry
-from mvrecon.core.parts import LISTED, LOSSES, METRICS, REGISTRIES
-from mvrecon.core.signatures import REQUIRED, describe
+from mvrecon.core.parts import LISTED, LOSSES, METRICS, REGISTRIES, describe
+from mvrecon.core.signatures import REQUIRED
 
 CATCH_ALL = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 PARTS = [(kind, name) for kind, known in REGISTRIES.items() for name in known.names()]

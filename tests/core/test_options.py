@@ -11,9 +11,8 @@ import mvrecon.apps.train
 from mvrecon.apps.config import absolute_paths
 from mvrecon.apps.settings import EvalSettings, ReconstructSettings, TrainSettings
 from mvrecon.core.options import check, with_paths
-from mvrecon.core.parts import METHODS, PROJECTORS
+from mvrecon.core.parts import METHODS, PROJECTORS, describe
 from mvrecon.core.quantities import Pair
-from mvrecon.core.signatures import describe
 from mvrecon.methods.method import build_method
 from tests.faults.plugins import plugin
 from tests.training.lives import OPTIONS

@@ -22,8 +22,8 @@ from hydra.errors import HydraException
 from mvrecon.apps.settings import SECTIONS
 from mvrecon.core.files.checks import file_in
 from mvrecon.core.machine import world
-from mvrecon.core.parts import LISTED
-from mvrecon.core.signatures import alternatives, describe, describe_section
+from mvrecon.core.parts import LISTED, describe, describe_section
+from mvrecon.core.signatures import alternatives
 
 #: What a path with a meaning in Hydra's grammar has in it, as that of a sweep's run.
 GRAMMAR_CHARACTERS = set("=,;()[]{}' ")

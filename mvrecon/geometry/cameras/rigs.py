@@ -21,9 +21,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.parts import OptionsOf
 from mvrecon.core.quantities import Pair, PositiveFloat, PositiveInt, Triple
 from mvrecon.core.registry import check_options
+from mvrecon.core.signatures import OptionsOf
 from mvrecon.geometry.cameras.camera import Cameras, Extent
 from mvrecon.geometry.cameras.formats.common import angles_in
 from mvrecon.geometry.grid import Grid

@@ -13,9 +13,10 @@ from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
 from mvrecon.core.options import parts_in
-from mvrecon.core.parts import LISTED, METHODS, ClassicalPart, OptionsOf
+from mvrecon.core.parts import LISTED, METHODS, ClassicalPart
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt
 from mvrecon.core.registry import check_options
+from mvrecon.core.signatures import OptionsOf
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.sirt import inverse_sums, sirt, with_ray_weights
 from mvrecon.methods.learned.geometry import Geometry

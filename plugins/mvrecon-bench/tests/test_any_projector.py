@@ -8,8 +8,7 @@ import pytest
 import torch
 from torch.nn.functional import grid_sample
 
-from mvrecon.core.parts import PROJECTORS
-from mvrecon.core.signatures import required
+from mvrecon.core.parts import PROJECTORS, required
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.methods.classical.mlem import mlem

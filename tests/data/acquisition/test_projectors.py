@@ -5,8 +5,7 @@ from typing import Any
 import pytest
 import torch
 
-from mvrecon.core.parts import PROJECTORS, SCENES
-from mvrecon.core.signatures import required
+from mvrecon.core.parts import PROJECTORS, SCENES, required
 from mvrecon.data.acquisition.acquired import Acquired, Projection, source_of
 from mvrecon.data.acquisition.detector import Acquisition
 from mvrecon.geometry.cameras.rigs import circular, dome, parallel

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mvrecon.core.files.atomic import write_text
-from mvrecon.core.parts import REGISTRIES
+from mvrecon.core.parts import REGISTRIES, required
 from mvrecon.core.registry import hint
-from mvrecon.core.signatures import required
 from mvrecon.operators.ray_transform import RAY_METHODS
 from mvrecon_bench.benchmarks.cases import DTYPES
 from mvrecon_bench.rows import Bench, Job, Row, figure, markdown

@@ -10,8 +10,8 @@ from omegaconf import DictConfig
 
 from mvrecon.apps.config import launch, record_of
 from mvrecon.apps.settings import Measurement
-from mvrecon.core.parts import OptionsOf
 from mvrecon.core.registry import import_plugins
+from mvrecon.core.signatures import OptionsOf
 
 
 @dataclass
