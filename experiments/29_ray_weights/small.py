@@ -21,9 +21,14 @@ import mvrecon as mv
 from mvrecon.core.parts import CAMERAS, SCENES
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
+from mvrecon.methods.calibration.self_alignment import self_aligned
 from mvrecon.methods.method import build_method
 
-FAULTS = {"views": 3, "rod": 0.25, "scatter": 0.15, "dead": 0.08, "probability": 0.5}
+CORRUPTED = {"views": 3, "rod": 0.25, "scatter": 0.15, "dead": 0.08, "probability": 0.5}
+MISALIGNED = {"shift_px": 1.0, "gain": 0.05, "tilt_deg": 3.0, "motion_mm": 20.0}
+MISALIGNED |= {"views": 3, "probability": 0.5}
+FAULTS = {"corrupted": CORRUPTED, "misaligned": MISALIGNED, "lost": MISALIGNED | {"lost": 1}}
+FAULTS["clean"] = None
 BATCH, RANGE = 4, 0.04
 PATIENTS, HELD_OUT = 170, range(150, 170)
 GRID = mv.Grid.centred(size=(16, 16, 16), spacing=(32.0, 20.0, 24.0))
@@ -49,6 +54,12 @@ def cases(
     samples = [acquired.sample(i, seed, GRID, cameras) for i in indices]
     parts = ([getattr(one, name) for one in samples] for name in ("views", "volume", "inside"))
     return tuple(map(torch.stack, parts))
+
+
+def aligned(views: Tensor, A: mv.LinearOperator) -> Tensor:
+    """The views of each case, aligned to each other."""
+    with torch.no_grad():
+        return torch.cat([self_aligned(A, part).views for part in views.split(BATCH)])
 
 
 def train(
@@ -114,7 +125,10 @@ def arguments() -> argparse.Namespace:
         default=180.0,
         help="arc in degrees of the cameras that methods assume; views have 180 (180)",
     )
-    parser.add_argument("--clean", action="store_true", help="views without faults")
+    parser.add_argument(
+        "--faults", choices=FAULTS, default="corrupted", help="faults of the views (corrupted)"
+    )
+    parser.add_argument("--align", action="store_true", help="align the views of each case")
     parser.add_argument(
         "--validate", action="store_true", help="test on 20 patients that training leaves out"
     )
@@ -125,13 +139,15 @@ def main() -> None:
     """Train, test, add to the file."""
     given = arguments()
     torch.set_num_threads(1)
-    faults, A = None if given.clean else FAULTS, mv.Drr(GRID, rig(given.arc))
+    faults, A = FAULTS[given.faults], mv.Drr(GRID, rig(given.arc))
     train_file, test_file = (given.data / f"openkbp_{name}.h5" for name in ("train", "val"))
     left_out, tested = (HELD_OUT, train_file) if given.validate else (range(0), test_file)
     indices = (i for i in count() if i % PATIENTS not in left_out)
     indices = islice(indices, given.patients or min(BATCH * given.steps, 4000))
     views, volumes, _ = cases(train_file, indices, 0, given.patients is None, faults)
-    tests = cases(tested, left_out or range(33), 1, False, faults)
+    seen, *truth = cases(tested, left_out or range(33), 1, False, faults)
+    if given.align:
+        views, seen = aligned(views, A), aligned(seen, A)
     arms = OmegaConf.to_container(OmegaConf.load(given.arms))
     with given.out.open("a+", newline="") as file:
         file.seek(0)
@@ -150,7 +166,7 @@ def main() -> None:
             if trained:
                 train(method, A, views, volumes, seed, given.steps, rate)
             seconds = round(time.process_time() - begun)
-            for case, scores in enumerate(errors(method, A, *tests)):
+            for case, scores in enumerate(errors(method, A, seen, *truth)):
                 writer.writerow([*row, case, *(round(x, 4) for x in scores), seconds])
             file.flush()
 
