@@ -21,6 +21,7 @@ import mvrecon as mv
 from mvrecon.data.attenuation import attenuation
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review
+from mvrecon.report.viz.sheet import ColourScale, Column, Panel, sheet
 
 #: The detector's pixels in mm, and the grey values of the scan's dark and flat field.
 PIXEL, DARK, FLAT = 4.0, 100.0, 50_000.0
@@ -81,15 +82,15 @@ def coronal(volumes: dict[str, Tensor], truth: Tensor, grid: mv.Grid):
     case = review.CaseSheets(title, grid, WHITE, "1/mm").about(truth)
     inside = torch.ones_like(truth, dtype=torch.bool)[None]
 
-    def plane(volume: Tensor, scale: review.ColourScale) -> review.Panel:
+    def plane(volume: Tensor, scale: ColourScale) -> Panel:
         return case.panels(volume, scale)[1]
 
-    columns = [review.Column("truth", [plane(truth, case.value()), None])]
+    columns = [Column("truth", [plane(truth, case.value()), None])]
     for name, x in volumes.items():
         psnr = volume_metrics(x[None], truth[None], inside, WHITE)["psnr"]
         error = plane(x - truth, case.error(0.25, "error, volume - truth"))
-        columns.append(review.Column(f"{name}\n{psnr:.1f} dB", [plane(x, case.value()), error]))
-    return review.sheet(case.name, columns, (plane(truth, case.value()).name, "error"))
+        columns.append(Column(f"{name}\n{psnr:.1f} dB", [plane(x, case.value()), error]))
+    return sheet(case.name, columns, (plane(truth, case.value()).name, "error"))
 
 
 def main(scan: Path, volumes: Path, folder: Path) -> None:

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from mvrecon.report.viz import review
-from mvrecon.report.viz.review import BAR_STRIP, LINE_HEIGHT, MOSAIC_WIDTH
+from mvrecon.report.viz.review import MOSAIC_WIDTH
+from mvrecon.report.viz.sheet import BAR_STRIP, LINE_HEIGHT, ColourScale
 
 #: Pixels above and below the views: text has twice its usual size.
 ABOVE, BELOW = 2 * LINE_HEIGHT, 2 * BAR_STRIP
@@ -43,6 +44,6 @@ def test_counts_that_are_scaled_to_the_activity_are_shown_as_counts(monkeypatch)
     counts[0, 0, 0] = 100  # a hot pixel does not darken the rest
     panel = review.mosaic(counts * 1.1e-4, unit="spect of activity")
     top = counts.quantile(0.999).item()
-    assert top < 20 and panel.scale == review.ColourScale(0.0, top, "counts")
+    assert top < 20 and panel.scale == ColourScale(0.0, top, "counts")
     panel = review.mosaic(torch.rand(8, 16, 16), unit="spect of activity")
     assert panel.scale.name == "counts (scaled to the activity)"

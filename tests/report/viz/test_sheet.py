@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mvrecon.report.viz.images import Edges
-from mvrecon.report.viz.review import (
+from mvrecon.report.viz.sheet import (
     BAR_STRIP,
     MAX_TILES,
     SHEET_WIDTH,
