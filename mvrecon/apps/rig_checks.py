@@ -52,8 +52,9 @@ MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
 #: relative to it.
 ARCS_DEGREES, MAX_ARCS_ASIDE = (360, 180, 210, 240, 270, 300, 330), 3
 MAX_STEP_DEVIATION, MIN_ARC_CHANGE = 0.02, 0.05
-#: Wrong angles leave at most so many times what varies between views: over half a turn, the views of
-#: a small object at r from the axis have it aside by r / sqrt(2), of which the mean takes 2 r / pi.
+#: Wrong angles leave at most so many times what varies between views: over half a turn, views of
+#: a small object at r from the axis have it aside by r / sqrt(2), of which their mean may have
+#: 2 r / pi.
 MAX_LEFT_BY_ANGLES = (0.5 / (0.5 - 4 / math.pi**2)) ** 0.5
 #: Size of the grid for views that end inside the object, relative to theirs.
 EXTENDED_GRID_FACTOR = 1.5

@@ -563,7 +563,8 @@ def test_half_a_turn_stated_as_a_full_one_is_named_wherever_the_object_is(centre
     detector = {"pixels": [1, 64], "pixel_mm": 1.6}
     rig, stated = (parallel(90, detector, arc_degrees=arc) for arc in (180.0, 360.0))
     x, y = centre
-    body = ellipsoids(((x, y, 0.0), (18.0, 12.0, 400.0), 0.02), ((x + 5, y, 0.0), (4, 4, 400), 0.01))
+    large, small = (18.0, 12.0, 400.0), (4.0, 4.0, 400.0)
+    body = ellipsoids(((x, y, 0.0), large, 0.02), ((x + 5, y, 0.0), small, 0.01))
     (words,) = checked(scan_of_phantom(body, rig, stated), "fbp", 0.3)
     assert "over 180 degrees instead of over 360" in words and "camera.arc_degrees" in words
 
