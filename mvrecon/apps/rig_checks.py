@@ -52,6 +52,10 @@ MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
 #: relative to it.
 ARCS_DEGREES, MAX_ARCS_ASIDE = (360, 180, 210, 240, 270, 300, 330), 3
 MAX_STEP_DEVIATION, MIN_ARC_CHANGE = 0.02, 0.05
+#: Wrong angles leave at most so many times what varies between views: over half a turn, views of
+#: a small object at r from the axis have it aside by r / sqrt(2), of which their mean may have
+#: 2 r / pi.
+MAX_LEFT_BY_ANGLES = (0.5 / (0.5 - 4 / math.pi**2)) ** 0.5
 #: Size of the grid for views that end inside the object, relative to theirs.
 EXTENDED_GRID_FACTOR = 1.5
 #: What is asked of views that fit better in another orientation than in the stored one.
@@ -93,8 +97,9 @@ def better_rig(seen: "SomeViews") -> str | None:
     # of views cut at a side, as of a half fan, a slight shift may make up for coarse voxels
     slight = not seen.cut[1].any()
     axis = _shifted(seen, stored, contradicted) if contradicted or slight else []
-    # angles have no part in what all views share: a body of revolution fits any
-    turned = _turned(seen) if contradicted and before <= seen.variation else []
+    # a body of revolution fits any angles, which have no part in what all views share
+    by_angles = before <= MAX_LEFT_BY_ANGLES * seen.variation
+    turned = _turned(seen) if contradicted and by_angles else []
     rigs = [*axis, *(_oriented(seen) if contradicted else ()), *turned]
     least = min((rig.nrmse for rig in rigs), default=0.0)
     if before > MIN_TWO_FAULTS and least > MAX_RESIDUAL_RATIO * stored.nrmse:
@@ -227,9 +232,7 @@ class SomeViews(NamedTuple):
 
     @property
     def variation(self) -> float:
-        """Deviation of the views from their mean, relative to them: what wrong angles leave at
-        most.
-        """
+        """Deviation of the views from their mean, relative to them."""
         apart = self.views - self.views.mean(dim=2, keepdim=True)
         return (apart.norm() / self.views.norm()).item()
 

@@ -123,6 +123,9 @@ def covering_pixels(cameras: Cameras, grid: Grid) -> tuple[float, float]:
     """Return the least number of rows and columns, as fractions, with which every detector about
     its present centre sees the grid's inscribed cylinder along z, in pixels of the present pitch.
 
+    One slice is seen by a fan: its rim counts in its plane, and its thickness on its axis, as the
+    part of the rim that is near a source would take a second row.
+
     Raises:
         ValueError: a source within the cylinder, or behind which a part of it lies.
     """
@@ -131,6 +134,9 @@ def covering_pixels(cameras: Cameras, grid: Grid) -> tuple[float, float]:
     outside = 1 / math.cos(math.pi / RIM_POINTS)  # the polygon encloses the circle
     x, y = (outside * f(angle) for f in (torch.cos, torch.sin))
     rims = torch.cat([torch.stack([x, y, torch.full_like(x, end)], dim=-1) for end in (-1, 1)])
+    if grid.shape[0] == 1:
+        parts = rims.new_tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        rims = (rims * parts[:, None]).flatten(0, 1)
     affine = centred_affine(grid)
     half = torch.tensor(grid.size, dtype=torch.float64) / 2
     uvz = rig.project((rims * half) @ affine[:3, :3].T + affine[:3, 3])

@@ -171,6 +171,24 @@ def test_detector_fit_has_pixels_of_a_voxel_at_the_centre():
     assert made["detector"]["pixel_mm"] == pytest.approx(6.0 * 1.5)
 
 
+@pytest.mark.parametrize("name", RIGS)
+def test_one_slice_is_fitted_by_a_fan(name):
+    """One row of pixels as wide as a voxel, or as tall as a thicker slice takes on its axis, and
+    the whole slice of cameras that look down on it. A grid of two slices is a cone's.
+    """
+    box = {"size": [48, 40, 1], "spacing": 6.0}
+    made = fitted({"name": name, **RIGS[name], "detector": "fit"}, box)
+    rig, centres = CAMERAS.from_config(made), voxel_centres(Grid.centred(**box))
+    inside = (centres[..., :2] / torch.tensor([144.0, 120.0])).square().sum(-1) <= 1
+    assert sees(rig, centres[inside]).all()
+    assert rig.shape[0] > 20 if name == "dome" else rig.shape[0] == 1
+    thick = {**box, "spacing": [6.0, 6.0, 30.0]}
+    made = fitted({"name": name, **RIGS[name], "detector": "fit"}, thick)
+    assert name == "dome" or made["detector"]["pixels"][0] == 5
+    made = fitted({"name": name, **RIGS[name], "detector": "fit"}, {**box, "size": [48, 40, 2]})
+    assert name == "dome" or made["detector"]["pixels"][0] == (2 if name == "parallel" else 3)
+
+
 def test_a_source_inside_of_the_grid_has_no_fitting_detector():
     camera = {"name": "circular", "n_views": 8, "sid": 150.0, "sdd": 900.0, "detector": "fit"}
     with pytest.raises(ValueError, match="behind the source"):
