@@ -75,6 +75,12 @@ KEYS = (
         "applied",
         "of scatter from another file, whose counts are scaled to that of the views",
     ),
+    Key(
+        _first("time per projection (sec)"),
+        "applied",
+        "the duration of a view; compared with the image duration, that of all views or of one",
+    ),
+    Key("study duration (sec)", "ignored", "may include pauses"),
     Key(_first("image relative start time (sec)"), "ignored", "one image in a file"),
     Key(_first("image data type description"), "ignored", "one type in a file"),
     Key(
