@@ -363,6 +363,25 @@ def test_counts_of_interfile_are_scaled_by_the_durations_of_both_files(tmp_path:
         scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}")
 
 
+@pytest.mark.parametrize("pixel_mm", [(2.0, 1.0), (1.5, 2.0), (20.0, 15.0)])
+def test_pixels_of_interfile_are_those_of_the_cameras(pixel_mm, tmp_path: Path):
+    """The scaling factors, in the order u, v, with rows and columns exchanged, or in another unit;
+    0, which states none, is not compared.
+    """
+    path = interfile(tmp_path / "a.hs", 9.0)
+    down, right = pixel_mm
+    text = path.read_text()
+    for axis, before, after in ((1, "1.5", right), (2, "2", down)):
+        key = f"!scaling factor (mm/pixel) [{axis}] := "
+        text = text.replace(f"{key}{before}\n", f"{key}{after}\n")
+    scan(path, rig(*ANGLES))
+    path.write_text(text)
+    with pytest.raises(Refused, match=rf"file's pixels of {down:g} x {right:g} mm .*got 2 x 1.5"):
+        scan(path, rig(*ANGLES))
+    path.write_text(text.replace(f"[1] := {right}", "[1] := 0"))
+    scan(path, rig(*ANGLES))
+
+
 EACH = "time per projection (sec)"
 
 

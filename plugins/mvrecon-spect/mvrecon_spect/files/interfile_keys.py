@@ -115,7 +115,11 @@ CONTENT: dict[Content, tuple[Key, ...]] = {
         Key("number of projections", "applied"),
         Key("number of dimensions", "refused", "rows and columns of each view", (2, 3)),
         Key(_axes("matrix size", 2), "applied"),
-        Key(_axes("scaling factor (mm/pixel)", 2), "applied", "of STIR's pinhole systems"),
+        Key(
+            _axes("scaling factor (mm/pixel)", 2),
+            "applied",
+            "of STIR's pinhole systems; compared with the pixel size of other cameras",
+        ),
         Key(
             "matrix size [3], total number of images, number of images/window, "
             "number of images/energy window",

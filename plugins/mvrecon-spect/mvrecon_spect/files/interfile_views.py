@@ -38,6 +38,8 @@ class InterfileViews(ProjectionStack):
         names = [f"{path.stem} {k}" for k in range(views)]
         low, high = (header.number(f"energy window {end} level", 0.0) for end in ("lower", "upper"))
         self.window_kev = (low, high) if high > low > 0 else None
+        down, right = (header.number(f"scaling factor (mm/pixel) [{axis}]", 0.0) for axis in (2, 1))
+        self.pixel_mm = (down, right) if min(down, right) > 0 else None
         self.duration_s, self.total_s = _durations(header, views)
         super().__init__(path, names, (rows, columns), np.dtype("f4"))
 
