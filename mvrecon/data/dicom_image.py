@@ -80,6 +80,12 @@ MACROS = {
         "PixelIntensityRelationshipLUT Exposure XRayFilter"
     ).split()
 }
+#: Private attributes of projections in DICOM-CT-PD (Chen and others, Med. Phys. 42, 2015).
+PRIVATE = {
+    0x7029100B: "DetectorShape",
+    0x70291010: "NumberofDetectorRows",
+    0x70291011: "NumberofDetectorColumns",
+}
 #: Sequences of functional groups that describe other images.
 OTHERS = re.compile("Referenced|Source|Derivation|Contributing|Original|ConversionSource")
 
@@ -179,7 +185,7 @@ class DicomImage:
         found = []
         with file_errors(self.path, f"has a {name} that cannot be read"):
             for place, holders in (*self._image, *own):
-                found += [(place, group[name].value) for group in holders.get(name, ())]
+                found += [(place, group[tag].value) for group, tag in holders.get(name, ())]
         return [(place, value) for place, value in found if not _empty(value)]
 
     def values(self, name: str) -> list[Any]:
@@ -298,7 +304,8 @@ class DicomImage:
 def _holders(
     group: Any, held: dict[str, list[Any]], inside: Callable[[str], bool] | None = None
 ) -> dict[str, list[Any]]:
-    """The data sets with each attribute: a functional group, and those nested in its sequences.
+    """The data sets with each attribute, and its tag: a functional group, and those nested in its
+    sequences.
 
     Args:
         group: a data set of pydicom.
@@ -308,8 +315,8 @@ def _holders(
     from pydicom.datadict import keyword_for_tag
 
     for tag in list(group.keys()):
-        name = keyword_for_tag(tag)  # none of private attributes
-        held.setdefault(name, []).append(group)
+        name = PRIVATE.get(tag) or keyword_for_tag(tag)  # "" of other private attributes
+        held.setdefault(name, []).append((group, tag))
         enter = inside(name) if inside else not OTHERS.match(name)
         if name.endswith("Sequence") and enter:
             for item in group[tag].value or []:

@@ -140,7 +140,8 @@ def _views(folder: Path) -> dict[str, tuple[Callable[[Path], Any], bytes, Wrap, 
         dicom_image(folder / "v.dcm", HU.astype("u2"), RescaleSlope=2, RescaleIntercept=-1024)
     write_example(folder / "e.h5", Example(HU))
     with h5py.File(folder / "v.h5", "w") as file:
-        file.create_dataset("views", data=HU.astype("f4"), compression="gzip", shuffle=True)
+        views = file.create_dataset("views", data=HU.astype("f4"), compression="gzip", shuffle=True)
+        views.attrs["unit"] = "1/mm * mm"
     tomo(folder / "v.nxs")
     exchange(folder / "x.h5")
     tifffile.imwrite(folder / "v.ome.tif", HU.astype("u2"), metadata={"axes": "TYX"})

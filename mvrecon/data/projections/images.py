@@ -58,6 +58,8 @@ CAMERA_PLACES = (
     "RTImageSID",
     "RadiationMachineSAD",
 )
+#: Rows and columns of the detector in DICOM-CT-PD.
+PIXELS = ("NumberofDetectorRows", "NumberofDetectorColumns")
 #: All that are compared between views with a warning.
 COMPARED = (*exposures.DICOM, *BEAM, *CAMERA_PLACES)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
@@ -81,6 +83,17 @@ DICOM_KEYS = (
     Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
     Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
     Key("PixelDataAreaRotationAngleRelativeToFOV", "refused", "as FieldOfViewRotation", (0,)),
+    Key(
+        "DetectorShape",
+        "refused",
+        "DICOM-CT-PD's: cameras are flat; convert the views to those of a flat detector",
+        ("FLAT",),
+    ),
+    Key(
+        ", ".join(PIXELS),
+        "compared",
+        "DICOM-CT-PD's, with Rows and Columns",
+    ),
     *ONE_FILE,
     Key("AppliedMaskSubtractionFlag", "refused", "grey values, not differences", ("NO",)),
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
@@ -401,6 +414,12 @@ def _dicom_header(file: Path) -> Header:
             f"{file}: expected frames in the order of their FrameAcquisitionNumber, got "
             f"{shown(numbers)}; sort the frames"
         )
+    for name, size in zip(PIXELS, image.shape, strict=True):
+        if (stated := image.value(name)) is not None and int(stated) != size:
+            raise Refused(
+                f"{file}: expected images with as many rows and columns, {image.shape}, as the "
+                f"detector of DICOM-CT-PD, got {name} {stated}; transpose the images"
+            )
     (kind, ends), scales = stored_type(image), {scale[:2] for scale in scales_of(image)}
     tops = {max(slope * end + d for end in ends) if ends else None for slope, d in scales}
     return Header(

@@ -159,8 +159,9 @@ def hdf5_views(
     with held(), file_errors(path, "cannot be read as HDF5"):
         if dataset is angles is image_key is None:
             place = followed(path, "/views")
-            if place is not None:
+            if place is not None and texts_at([place], "unit"):
                 return Hdf5Views(path)
+            dataset = None if place is None else "/views"  # of another program
         places = _Layout.of(path, dataset, layout == "sinogram")
         if angles is not None:
             places = places._replace(angles=named(path, angles))

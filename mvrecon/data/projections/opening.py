@@ -12,7 +12,7 @@ from h5py import Dataset
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused, check_file, file_errors
+from mvrecon.core.files.checks import Refused
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file, same
 from mvrecon.data.linked import Place, followed, listing, values_at
@@ -67,10 +67,12 @@ def open_projections(
         FileNotFoundError: nothing is there.
         ImportError: a library of the extra `io` or `rtk` is not installed.
         Refused: an empty folder, a folder of a simulated case, images of several sizes or kinds of
-            names, missing numbers, other endings, damage.
+            names, missing numbers, truth values, other endings, damage.
     """
     given = {option: name for option, name in names.items() if name is not None}
     stack = _opened(Path(path).expanduser(), pattern, gaps, fields, layout, given)
+    if stack.dtype.kind == "b":  # of masks alone
+        raise Refused(f"{path}: expected pixels that are integers or floats, got {stack.dtype}")
     return Sinograms(stack) if layout == "sinogram" else stack
 
 
@@ -120,11 +122,7 @@ def _expected() -> str:
 def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
     """Bad pixels of a file of the views' size; raises Refused for others."""
     path = Path(path).expanduser()
-    if path.suffix.lower() == ".npy":  # which may hold truth values
-        check_file(path, "a mask [v u]")
-        with file_errors(path, "cannot be read as a NumPy array"):
-            return read_mask(path, shape, np.load(path, allow_pickle=False))
-    stack = open_projections(path)
+    stack = _opened(path, None, False, (), None, {})
     if stack.n_views > 1:
         raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
     return read_mask(path, shape, stack.read(0, 1)[0].numpy())

@@ -14,12 +14,12 @@ from mvrecon.core.files.keys import Key, check_keys
 from mvrecon.data.projections.stack import Header
 
 #: Pixel types of a grey PNG by Pillow's mode.
-MODES = {"L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
+MODES = {"1": "?", "L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
 #: Tag of EXIF for the order of rows and columns.
 ORIENTATION = 274
 #: Chunks and fields of PNG that change the pixels.
 PNG_KEYS = (
-    Key("bit depth", "refused", "Pillow rescales fewer bits", (8, 16)),
+    Key("bit depth", "refused", "1 in masks alone; Pillow rescales 2 and 4 bits", (1, 8, 16)),
     Key("colour type", "refused", "grey values", (0,)),
     Key("interlace method", "applied"),
     Key("acTL", "refused", "one image in each file"),

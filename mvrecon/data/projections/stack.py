@@ -82,7 +82,7 @@ class ProjectionStack(ABC):
         dtype: type of the pixels as they are stored.
 
     Raises:
-        Refused: no view or too many, or pixels that are not integers or floats.
+        Refused: no view or too many, or pixels that are no numbers or truth values.
     """
 
     #: Kind of the pixels if the format defines it.
@@ -139,7 +139,7 @@ class ProjectionStack(ABC):
         if not 0 < len(self.names) <= VIEWS or min(self.shape) < 1:
             got = f"{len(self.names)} views of {self.shape[0]} x {self.shape[1]} pixels"
             raise Refused(f"{path}: expected 1 to {VIEWS} views with pixels, got {got}")
-        if self.dtype.kind not in "iuf":
+        if self.dtype.kind not in "biuf":
             raise Refused(f"{path}: expected pixels that are integers or floats, got {self.dtype}")
 
     @property

@@ -22,7 +22,7 @@ RATIOS = ("FNumber", "ExposureBiasValue")
 #: Tags of TIFF that change the pixels or their order.
 TIFF_KEYS = (
     Key("BitsPerSample", "applied", "also gives the largest grey value"),
-    Key("SampleFormat", "applied", "integers and floats of any width"),
+    Key("SampleFormat", "applied", "integers and floats of any width; one bit in masks alone"),
     Key("Compression", "applied"),
     Key("Predictor", "applied"),
     Key("FillOrder", "applied"),
@@ -257,7 +257,7 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
 
     check_keys(file, TIFF_KEYS, value_of)
     kind, (rows, columns) = page.dtype, page.shape if len(page.shape) == 2 else (0, 0)
-    if kind is None or kind.kind not in "iuf" or not 0 < rows <= EDGE or not 0 < columns <= EDGE:
+    if kind is None or kind.kind not in "biuf" or not 0 < rows <= EDGE or not 0 < columns <= EDGE:
         raise Refused(
             f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got "
             f"{' x '.join(map(str, page.shape))} of the type {kind}"

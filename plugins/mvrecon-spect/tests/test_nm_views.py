@@ -363,6 +363,52 @@ def test_counts_of_interfile_are_scaled_by_the_durations_of_both_files(tmp_path:
         scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}")
 
 
+@pytest.mark.parametrize("pixel_mm", [(2.0, 1.0), (1.5, 2.0), (20.0, 15.0)])
+def test_pixels_of_interfile_are_those_of_the_cameras(pixel_mm, tmp_path: Path):
+    """The scaling factors, in the order u, v, with rows and columns exchanged, or in another unit;
+    0, which states none, is not compared.
+    """
+    path = interfile(tmp_path / "a.hs", 9.0)
+    down, right = pixel_mm
+    text = path.read_text()
+    for axis, before, after in ((1, "1.5", right), (2, "2", down)):
+        key = f"!scaling factor (mm/pixel) [{axis}] := "
+        text = text.replace(f"{key}{before}\n", f"{key}{after}\n")
+    scan(path, rig(*ANGLES))
+    path.write_text(text)
+    with pytest.raises(Refused, match=rf"file's pixels of {down:g} x {right:g} mm .*got 2 x 1.5"):
+        scan(path, rig(*ANGLES))
+    path.write_text(text.replace(f"[1] := {right}", "[1] := 0"))
+    scan(path, rig(*ANGLES))
+
+
+EACH = "time per projection (sec)"
+
+
+def test_the_time_per_projection_of_interfile_is_the_duration_of_a_view(tmp_path: Path):
+    """As SIMIND and GATE state it, alone or beside the duration of all views, as converters to STIR
+    write it, or of one. 0 is none. Both files may state either.
+    """
+    path = interfile(tmp_path / "a.hs", 9.0, f"{EACH} := 20", kev=(126, 154))
+    for lines, share in (
+        ([f"{EACH} := 10"], 2.0),
+        ([f"{EACH}[1] := 20", "image duration (sec)[1] := 120"], 1.0),
+        ([f"{EACH} := 40", "image duration (sec) := 40", "study duration (sec) := 300"], 0.5),
+        ([f"{EACH} := 0", "image duration (sec)[1] := 60"], 2.0),
+    ):
+        other = interfile(tmp_path / "b.hs", 4.0, *lines)
+        found = scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}").scatter
+        assert torch.allclose(found, torch.tensor(0.5 * 4.0 * share))
+    other = interfile(tmp_path / "c.hs", 4.0, "study duration (sec) := 120")
+    with pytest.warns(UserWarning, match="taken to be of the duration of .*20 s and unknown"):
+        scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}")
+    other = interfile(tmp_path / "d.hs", 4.0, f"{EACH} := 20", "image duration (sec)[1] := 240")
+    with pytest.raises(Refused, match="'image duration .sec.' 120, the time per proj.*got 240"):
+        scan(path, rig(*ANGLES), f"scatter={{name: dew, lower: {other}}}")
+    with pytest.raises(Refused, match="factors.time_s=20 by the file, got 30"):
+        scan(path, rig(*ANGLES), "factors={name: detector, branching: 0.9, time_s: 30}")
+
+
 def test_windows_that_contradict_an_estimate_of_scatter(tmp_path: Path):
     """Widths in the files, the views themselves as a window, counts that are no whole numbers, and
     a window that is measured at another time. Unknown widths are those that are given.

@@ -578,6 +578,16 @@ def test_an_inconsistent_stir_file_is_refused(tmp_path: Path, name: str):
         read_stir(*files(tmp_path))
 
 
+def test_the_header_is_read_once(tmp_path: Path):
+    """A header without its last line is warned of once."""
+    write_stir(tmp_path, scan())
+    header, *texts = files(tmp_path)
+    header.write_text(header.read_text().replace("!END OF INTERFILE :=\n", ""))
+    with pytest.warns(UserWarning, match="is it cut short") as said:
+        read_stir(header, *texts)
+    assert len(said) == 1
+
+
 def test_interfile_data_is_a_plain_file_beside_the_header(tmp_path: Path):
     """Interfile counts are read from a plain file beside the header, and refused where negative."""
     inside, outside = tmp_path / "scan", tmp_path / "elsewhere"

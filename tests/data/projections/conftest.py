@@ -66,7 +66,9 @@ def array(path, values, packed=False):
         np.save(path, values)
     elif path.suffix == ".h5":
         with h5py.File(path, "w") as file:
-            file.create_dataset("views", data=values.astype("f4"), compression="gzip", shuffle=True)
+            options = {"compression": "gzip", "shuffle": True}
+            views = file.create_dataset("views", data=values.astype("f4"), **options)
+            views.attrs["unit"] = "1/mm * mm"
     else:
         sitk.WriteImage(sitk.GetImageFromArray(values), str(path), packed)
     return path

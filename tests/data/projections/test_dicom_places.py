@@ -338,3 +338,34 @@ def test_compressed_frames_are_counted(frames, tmp_path):
             continue
         with pytest.raises(Refused, match=f"NumberOfFrames, {frames}, got those of {VIEWS}"):
             pixels_of(tmp_path / "a.dcm")
+
+
+def test_curved_and_transposed_detectors_of_dicom_ct_pd_are_refused(tmp_path):
+    """Its private attributes, with and without the creator of their group, as they are in the
+    Mayo Clinic's library, and of an unknown type. Flat ones are read.
+    """
+    greys = grey()
+    rows, columns = greys.shape[-2:]
+    assert rows != columns
+
+    def written(shape, sizes, creator=True, kind="CS"):
+        path = tmp_path / "a.dcm"
+        dicom_image(path, greys)
+        dataset = pydicom.dcmread(path)
+        if creator:
+            dataset.private_block(0x7029, "DICOM-CT-PD", create=True)
+        dataset.add_new(0x7029100B, kind, shape)
+        for tag, size in zip((0x70291010, 0x70291011), sizes, strict=True):
+            dataset.add_new(tag, "US", size)
+        dataset.save_as(path)
+        return path
+
+    for creator in (True, False):
+        assert open_projections(written("FLAT", (rows, columns), creator)).shape == greys.shape[-2:]
+        for shape in ("CYLINDRICAL", "SPHERICAL"):
+            with pytest.raises(Refused, match=f"DetectorShape FLAT, got '{shape}'"):
+                open_projections(written(shape, (rows, columns), creator))
+        with pytest.raises(Refused, match=f"NumberofDetectorRows {columns}; transpose"):
+            open_projections(written("FLAT", (columns, rows), creator))
+    with pytest.raises(Refused, match="DetectorShape FLAT"):
+        open_projections(written(b"CYLINDRICAL ", (rows, columns), kind="UN"))

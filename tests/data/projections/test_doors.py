@@ -256,11 +256,32 @@ def test_an_h5_of_another_layout_is_refused(tmp_path):
         open_projections(path)
     with h5py.File(path, "w") as file:
         file["views"] = np.ones((3, 4), "f4")
+        file["views"].attrs["unit"] = "1/mm * mm"
     with pytest.raises(Refused, match=r"has float32 \(3, 4\); expected the views\.h5"):
         open_projections(path)
     path.write_bytes(b"no HDF5")
     with pytest.raises(Refused, match=r"a\.h5: not an HDF5 file, or cut short"):
         open_projections(path)
+
+
+@pytest.mark.parametrize("kind", ["f4", "f8", "u2"])
+def test_views_in_hdf5_without_a_unit_are_those_of_another_program(kind, tmp_path):
+    """Transmissions in a data set that is called as ours are not taken for line integrals: as of
+    frames of any name, the kind of floats is asked for, and integers are intensities.
+    """
+    values = np.full((2, 3, 4), 0.5 if kind != "u2" else 20_000, kind)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["views"] = values
+    if kind != "u2":
+        with pytest.raises(Refused, match=r"expected kind=integrals or kind=intensities"):
+            opened(tmp_path / "a.h5")
+        assert np.array_equal(opened(tmp_path / "a.h5", kind="integrals").whole().views, values)
+    found = opened(tmp_path / "a.h5", kind="intensities", flat=2.0 * float(values[0, 0, 0]))
+    assert np.allclose(found.whole().views, np.log(2))
+    with h5py.File(tmp_path / "a.h5", "a") as file:
+        file["views"].attrs["unit"] = "1/mm * mm"
+    if kind == "f4":
+        assert opened(tmp_path / "a.h5").kind == "integrals"
 
 
 OUTSIDE = [

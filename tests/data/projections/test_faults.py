@@ -181,7 +181,9 @@ def test_pixels_that_fields_show_to_be_wrong_are_left_out(hot, tmp_path):
 
 
 def test_a_mask_of_bad_pixels_is_an_image_or_an_array(tmp_path):
-    """Also of integrals and counts; another size, several images or other values are refused."""
+    """Also of integrals and counts, and of one bit per pixel, as views are not; another size,
+    several images or other values are refused.
+    """
     views = np.random.default_rng(1).uniform(0.5, 1, (3, 6, 8)).astype("f4")
     np.save(tmp_path / "views.npy", views)
     mask = np.zeros((6, 8), "u1")
@@ -189,7 +191,10 @@ def test_a_mask_of_bad_pixels_is_an_image_or_an_array(tmp_path):
     tifffile.imwrite(tmp_path / "mask.tif", mask)
     Pillow.fromarray(255 * mask).save(tmp_path / "mask.png")
     np.save(tmp_path / "mask.npy", mask.astype(bool))
-    for name in ("mask.tif", "mask.png", "mask.npy"):
+    tifffile.imwrite(tmp_path / "bits.tif", mask.astype(bool))
+    Pillow.fromarray(mask.astype(bool)).save(tmp_path / "packed.tif", compression="packbits")
+    Pillow.fromarray(mask.astype(bool)).save(tmp_path / "bits.png")
+    for name in ("mask.tif", "mask.png", "mask.npy", "bits.tif", "packed.tif", "bits.png"):
         for kind in ("integrals", "counts"):
             scan = opened(tmp_path / "views.npy", kind=kind, bad_pixels=tmp_path / name)
             with pytest.warns(UserWarning, match=r"7 of 48 .*\(column 5, one other pixel\)"):
@@ -200,6 +205,9 @@ def test_a_mask_of_bad_pixels_is_an_image_or_an_array(tmp_path):
             assert back.views[0, 1, 2].item() == pytest.approx(
                 views[0, [0, 2, 1, 1], [2, 2, 1, 3]].mean(), rel=1e-6
             )
+    for name in ("bits.tif", "packed.tif", "bits.png", "mask.npy"):
+        with pytest.raises(Refused, match="integers or floats, got bool"):
+            opened(tmp_path / name)
     for wrong, words in (
         (mask[:5], r"the views' \(6, 8\) pixels .*, got \(5, 8\)"),
         (np.arange(48, dtype="u1").reshape(6, 8), r"0 \(good\) and 1 \(bad\), got"),

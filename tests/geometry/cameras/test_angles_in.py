@@ -23,6 +23,8 @@ FORMS = {
     "l.txt": f"Angle (deg)\n{COLUMN}",
     "m.csv": "Bild;Angle (°)\n" + "\n".join(f"{k};{a}" for k, a in enumerate(ANGLES)),
     "n.csv": f"Angle (°)\n{COLUMN}",  # in Latin-1, as programs of Windows write it
+    "o.txt": f"# degrees, from radians; by Conrad, at the radius 3\n{COLUMN}  # rad\n",
+    "p.csv": f"Radiography: angle\n{COLUMN}",
     "f.tsv": "view\trotation\n" + "\n".join(f"{k}\t{a}" for k, a in enumerate(ANGLES)),
 }
 
@@ -47,6 +49,13 @@ REFUSED = {
     "radians": ("\n".join(str(a) for a in np.linspace(0, 3.1, 8)), "look like radians"),
     "a column of radians": ("theta_rad\n" + COLUMN, "expected degrees, got 'theta_rad'"),
     "radians in a name of two words": ("Angle (rad)\n" + COLUMN, "expected degrees"),
+    "three turns in radians by numpy.savetxt": ("# theta (rad)\n0\n18.85\n", "multiply by 57.29"),
+    "a comment below another": ("# of July\n# theta [rad]\n0\n3\n", "'of July theta .rad.'"),
+    "milliradians": ("theta_mrad\n0\n300\n", "multiply by 0.0572"),
+    "arc minutes": ("angle (arcmin)\n0\n300\n", "multiply by 0.01666667"),
+    "arc seconds": ("angle / arc sec\n0\n300\n", "multiply by 0.0002777"),
+    "gon": ("i,Winkel angle (gon)\n0,0\n1,100\n", "multiply by 0.9"),
+    "turns": ("rotation (turns)\n0\n0.5\n", "multiply by 360"),
     "comma decimals": ("0,5\n1,0\n", "expected one column"),
     "comma decimals under a name": ("angle\n0,5\n1,0\n", "got '0,5'"),
     "comma decimals in a column": ("angle;i\n0,5;1\n1,0;1\n", "got '0,5'"),

@@ -4,6 +4,7 @@ import inspect
 import math
 import re
 from collections.abc import Iterable, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -115,6 +116,16 @@ def number_lines(path: str | Path) -> list[list[float]]:
     return lines
 
 
+#: Units in the names of angles, in degrees; the first that is found counts.
+UNITS = {
+    "(?<![a-z])deg|°": 1.0,
+    r"(?<![a-z])m(illi.?)?rad(ian)?s?\b": math.degrees(1e-3),
+    r"(?<![a-z])(grad(ian)?s?|gon)\b": 0.9,
+    r"(\b|_|angle|theta|rotation)rad(ian)?s?\b": math.degrees(1),
+    r"(?<![a-z])arc.?min": 1 / 60,
+    r"(?<![a-z])arc.?sec": 1 / 3600,
+    r"(?<![a-z])(turns|revolutions|revs?)\b": 360.0,
+}
 #: Names of the columns of angles in a table, among others.
 ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
 
@@ -122,7 +133,7 @@ ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
 def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
     """Angles in degrees, one per view: a NumPy file, or text with one number per line, or a table
     with names in its first line, whose column is the one with a name such as angle or theta, or
-    that of `<file>:<column>`.
+    that of `<file>:<column>`. A name, or a comment before the numbers, may state the unit.
 
     Args:
         path: path of the file.
@@ -130,11 +141,12 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
 
     Raises:
         FileNotFoundError: nothing is there.
-        Refused: not one column of finite numbers, radians, or too many.
+        Refused: not one column of finite numbers, another unit, or too many.
     """
     name, angles = numbers_in(path, "angles", ANGLE_NAMES)
-    if re.search("rad", name, re.IGNORECASE):
-        raise Refused(f"{path}: expected degrees, got {name!r}; multiply by 57.29578")
+    degrees = (by for unit, by in UNITS.items() if re.search(unit, name, re.IGNORECASE))
+    if (factor := next(degrees, 1.0)) != 1:
+        raise Refused(f"{path}: expected degrees, got {shown(name)}; multiply by {factor:.7g}")
     with file_errors(path, "has no angles", "expected one number per line, or a table"):
         check_degrees(angles, small_arc, "angles")
         check_turning(angles)
@@ -142,7 +154,8 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
 
 
 def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, list[float]]:
-    """Numbers, one for each view, as `angles_in` reads them, and the name of their column, if any.
+    """Numbers, one for each view, as `angles_in` reads them, and the name of their column, or the
+    comment before them, if any.
 
     Args:
         path: path of the file.
@@ -177,10 +190,11 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, lis
 def _column(
     path: Path, column: str | None, what: str, known: re.Pattern
 ) -> tuple[str, list[float]]:
-    """The name and the numbers of a column of a text."""
-    whole = text_of(path, strict=False)
-    lines = [line.partition("#")[0].strip(" ") for line in whole.splitlines()]
-    lines = [line for line in lines if line.strip()]
+    """The name of a column of a text, else the comment before it, and its numbers."""
+    parts = [line.partition("#") for line in text_of(path, strict=False).splitlines()]
+    lines = [line.strip(" ") for line, _, _ in parts if line.strip()]
+    heads = takewhile(lambda part: not part[0].strip(), parts)
+    title = " ".join(comment.strip() for _, _, comment in heads).strip()
     if all(re.fullmatch(r"[^,;\t]+[,;\t]?", line) for line in lines):
         lines = [line.rstrip(",;\t") for line in lines]
     mark = next((m for m in "\t;," if lines and m in lines[0]), None)  # else blanks
@@ -207,7 +221,7 @@ def _column(
             f"{shown(sorted(widths))}; is it cut short, or are its decimals not points?"
         )
     numbers = [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
-    return names[found[0]] if names else "", numbers
+    return names[found[0]] if names else title, numbers
 
 
 def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Tensor, "m k"]:

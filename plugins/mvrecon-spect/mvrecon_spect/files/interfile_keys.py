@@ -75,6 +75,12 @@ KEYS = (
         "applied",
         "of scatter from another file, whose counts are scaled to that of the views",
     ),
+    Key(
+        _first("time per projection (sec)"),
+        "applied",
+        "the duration of a view; compared with the image duration, that of all views or of one",
+    ),
+    Key("study duration (sec)", "ignored", "may include pauses"),
     Key(_first("image relative start time (sec)"), "ignored", "one image in a file"),
     Key(_first("image data type description"), "ignored", "one type in a file"),
     Key(
@@ -109,7 +115,11 @@ CONTENT: dict[Content, tuple[Key, ...]] = {
         Key("number of projections", "applied"),
         Key("number of dimensions", "refused", "rows and columns of each view", (2, 3)),
         Key(_axes("matrix size", 2), "applied"),
-        Key(_axes("scaling factor (mm/pixel)", 2), "applied", "of STIR's pinhole systems"),
+        Key(
+            _axes("scaling factor (mm/pixel)", 2),
+            "applied",
+            "of STIR's pinhole systems; compared with the pixel size of other cameras",
+        ),
         Key(
             "matrix size [3], total number of images, number of images/window, "
             "number of images/energy window",

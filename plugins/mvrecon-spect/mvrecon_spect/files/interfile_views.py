@@ -6,8 +6,11 @@ import numpy as np
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.stack import ProjectionStack
-from mvrecon_spect.files.interfile import numbers_of, read_header
+from mvrecon_spect.files.interfile import Header, check_repeated, numbers_of, read_header
 from mvrecon_spect.files.stir import views_shape
+
+#: Relative difference of durations in whole seconds.
+CLOSE = 0.01
 
 
 class InterfileViews(ProjectionStack):
@@ -35,8 +38,9 @@ class InterfileViews(ProjectionStack):
         names = [f"{path.stem} {k}" for k in range(views)]
         low, high = (header.number(f"energy window {end} level", 0.0) for end in ("lower", "upper"))
         self.window_kev = (low, high) if high > low > 0 else None
-        seconds = header.number("image duration (sec)", 0.0)
-        self.total_s = seconds if seconds > 0 else None  # 0 and -1: unknown
+        down, right = (header.number(f"scaling factor (mm/pixel) [{axis}]", 0.0) for axis in (2, 1))
+        self.pixel_mm = (down, right) if min(down, right) > 0 else None
+        self.duration_s, self.total_s = _durations(header, views)
         super().__init__(path, names, (rows, columns), np.dtype("f4"))
 
     def _block(self, first: int, last: int) -> np.ndarray:
@@ -47,3 +51,20 @@ class InterfileViews(ProjectionStack):
                 f"views {first} to {last - 1}"
             )
         return counts
+
+
+def _durations(header: Header, views: int) -> tuple[float | None, float | None]:
+    """Durations in s of a view and of all; None where 0, -1 or no key says that it is unknown.
+
+    Raises:
+        Refused: an image duration that is neither.
+    """
+    each, image = (
+        header.number(f"{name} (sec)", 0.0) for name in ("time per projection", "image duration")
+    )
+    if each <= 0:
+        return None, image if image > 0 else None
+    if image > 0 and abs(image / each - 1) > CLOSE:
+        why = f"the time per projection of {views} projections"
+        check_repeated(header, ["image duration (sec)"], views * each, why, CLOSE)
+    return each, views * each

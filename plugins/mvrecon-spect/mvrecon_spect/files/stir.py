@@ -55,7 +55,7 @@ def read_stir(
         ValueError: an impossible geometry; see `StirSystem`.
     """
     header = read_header(path, "projections")
-    system = read_system(path, detector_file, collimator_file)
+    system = _system(header, detector_file, collimator_file)
     numbers = numbers_of(header, (len(system.angles), *system.shape))
     counts = torch.from_numpy(numbers.read(0, len(system.angles)))
     if not (counts.isfinite().all() and (counts >= 0).all()):
@@ -69,15 +69,20 @@ def read_system(
     collimator_file: str | Path | None = None,
 ) -> StirSystem:
     """Read the geometry of STIR's pinhole system in mm, without the counts; see `read_stir`."""
-    header = read_header(path, "projections")
+    return _system(read_header(path, "projections"), detector_file, collimator_file)
+
+
+def _system(
+    header: Header, detector_file: str | Path | None, collimator_file: str | Path | None
+) -> StirSystem:
     detector_file = detector_file or header.path.parent / "detector.txt"
     collimator_file = collimator_file or header.path.parent / "collimator.txt"
     detector = read_detector(detector_file)
     views, rows, columns = views_shape(header)
     if sum(ring.count for ring in detector.rings) != views:
         raise Refused(
-            f"{detector_file}: expected as many angles as there are projections in {path}, "
-            f"{views}, got {sum(ring.count for ring in detector.rings)}"
+            f"{detector_file}: expected as many angles as there are projections in "
+            f"{header.path}, {views}, got {sum(ring.count for ring in detector.rings)}"
         )
     _check_rotation(header, detector)
     down, along = (header.positive(f"scaling factor (mm/pixel) [{axis}]") for axis in (2, 1))
