@@ -1,7 +1,7 @@
 """Attenuation, and whatever is derived from it, follows every change of a map.
 
 Tried: memory of NumPy, `.numpy()` of a tensor, in-place operations, `.data`, an inference tensor,
-assignment, and the maps of cases; for whole rigs, subsets and blur, views, adjoints,
+assignment, the maps of cases, and compiled calls; for whole rigs, subsets and blur, views, adjoints,
 networks in evaluation and training; and cameras that change after construction.
 """
 
@@ -118,6 +118,22 @@ def test_the_operator_of_a_case_knows_its_map_before_its_first_call():
     torch.compiler.reset()
     y = torch.compile(B, backend="eager")(x)
     torch.testing.assert_close(y, Spect(GRID, RIG, mu=body())(x))
+
+
+@pytest.mark.parametrize("change", ["in place", "NumPy", "assigned"])
+def test_a_map_of_zeros_that_is_filled_later_attenuates_in_compiled_graphs(change):
+    """Tried too: `.data`, and a map that was not zero at first."""
+    mu, x = torch.zeros(GRID.shape), torch.rand(1, 1, *GRID.shape)
+    A = Spect(GRID, RIG, mu=mu)
+    torch.compiler.reset()
+    compiled = torch.compile(A, backend="eager")
+    compiled(x)
+    for other in (body(), torch.zeros(GRID.shape), body(0.5)):
+        if change == "assigned":
+            A.A.mu = other
+        else:
+            FILLS[change](mu, other)
+        torch.testing.assert_close(compiled(x), Spect(GRID, RIG, mu=other)(x))
 
 
 def test_pinholes_of_a_changed_rig_are_refused():

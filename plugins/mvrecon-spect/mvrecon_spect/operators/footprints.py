@@ -212,14 +212,14 @@ class Footprints(FixedGeometry):
 
     @property
     def clear(self) -> bool:
-        """Whether mu is zero everywhere and requires no gradient; as at the last call in graphs of
-        `torch.compile`.
+        """Whether mu is zero everywhere and requires no gradient; as at the last call in programs
+        of `torch.export`.
         """
         mu = self.mu
         if mu is None or mu.requires_grad:
             return mu is None
-        if not torch.compiler.is_compiling():
-            self.last_clear = kept(mu, "is zero", lambda: not bool((mu != 0).any()))
+        if not torch.compiler.is_exporting():
+            self.last_clear = _is_zero(mu)
         return self.last_clear
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
@@ -267,6 +267,14 @@ class Footprints(FixedGeometry):
             return None
         rays = ACROSS if pixel_in_voxels(self.cameras, self.grid) > 0.5 + 1e-6 else 1
         return PixelIntegral(self.hole.weight(self.cameras), rays)
+
+
+@torch.compiler.disable
+def _is_zero(mu: Tensor) -> bool:
+    """Whether a map is zero now, also between the graphs of `torch.compile`, which would keep the
+    answer of their first call.
+    """
+    return kept(mu, "is zero", lambda: not bool((mu != 0).any()))
 
 
 #: The operators by the reference.
