@@ -113,12 +113,13 @@ class RayTransform(FixedGeometry):
             if name not in names[what]:
                 raise ValueError(f"Unknown {what} {name!r}. Known: {', '.join(names[what])}")
         self.built_from(grid, cameras)
-        self.method, self.backend = method, backend
+        self._method, self._rays_per_pixel, self.backend = method, rays_per_pixel, backend
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
-        self.kernel, self.rays_per_pixel, self.skip = _kernel(method, grid), rays_per_pixel, skip
+        self.kernel, self.skip = _kernel(method, grid), skip
         self.last_backend: str | None = None
         self.ray_extent = list(cameras.ray_extent)
-        lines = self._lines()
+        with torch.inference_mode(False):  # else no derivative could save them
+            lines = self._lines()
         # without a graph, but with torch.func's levels
         self.register_buffer(
             "fixed_lines", lines.detach() if lines.requires_grad else lines, persistent=False
@@ -133,6 +134,16 @@ class RayTransform(FixedGeometry):
         Raises:
             ValueError: rays that the operator does not support.
         """
+
+    @property
+    def method(self) -> str:
+        """The discretisation; fixed, as the number of rays, by what was computed from it."""
+        return self._method
+
+    @property
+    def rays_per_pixel(self) -> int:
+        """Rays each way over a pixel."""
+        return self._rays_per_pixel
 
     @property
     def device(self) -> torch.device:

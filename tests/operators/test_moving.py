@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from mvrecon.operators.selection import ray_subset, view_subset
+from mvrecon.testing import derivative_gap
 from tests.operators.cases import DIFFERENTIABLE, Case, noise
 
 KINDS = ("cone", "beams", "explicit")
@@ -95,3 +96,25 @@ def test_cameras_created_in_inference_mode_are_supported():
     with torch.inference_mode():
         rays = replace(case.rays, source=case.rays.source * 1)
         assert torch.equal(replace(case, rays=rays).build()(x), case.build()(x))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_projector_built_in_inference_mode_has_gradients(kind):
+    """In volumes, views and the pose; an evaluation may have built it before a training."""
+    case, (x, y) = own(kind, wants=True), noise(DIFFERENTIABLE[kind])
+    fixed = own(kind, wants=False)
+    with torch.inference_mode():
+        operators = fixed.build(), case.build()
+    for A, B in zip(operators, (fixed.build(), case.build()), strict=True):
+        assert derivative_gap(A, x, y) < 1e-12
+        assert torch.equal(A(x), B(x))
+    (change,) = torch.autograd.grad(operators[1](x).square().sum(), case.rays.source)
+    assert change.norm() > 0.1
+
+
+@pytest.mark.parametrize(("name", "value"), [("method", "siddon"), ("rays_per_pixel", 2)])
+def test_options_behind_the_computed_rays_cannot_be_assigned(name, value):
+    """Views would be of the old rays, or a mixture: refused, as another grid or rig is."""
+    A = DIFFERENTIABLE["cone"].build()
+    with pytest.raises(AttributeError, match=name):
+        setattr(A, name, value)

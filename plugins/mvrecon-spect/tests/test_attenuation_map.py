@@ -8,6 +8,7 @@ import torch
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Grid, voxel_centres
+from mvrecon.testing import derivative_gap
 from mvrecon_spect.operators.projector import Spect
 
 WATER, RADIUS = 0.01536, 100.0
@@ -111,3 +112,25 @@ def test_a_map_of_any_precision_attenuates_alike(dtype):
     mu, x = torch.full(grid.shape, 0.015625), torch.rand(1, 1, *grid.shape)
     expected = Spect(grid, rig, mu=mu)(x)
     torch.testing.assert_close(Spect(grid, rig, mu=mu.to(dtype))(x), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_casting_an_operator_keeps_its_map(dtype):
+    """As of a network in half precision that holds it; the map remains that of its owner, whose
+    changes are followed. Tried too: copies, subsets and operators of cases, and back to float32.
+    """
+    grid, rig = Grid.centred(10, spacing=12.0), dcspect80(pixels=8, columns=[0])
+    mu, x = 0.005 + 0.01 * torch.rand(grid.shape), torch.rand(1, 1, *grid.shape)
+    A = Spect(grid, rig, mu=mu).to(dtype)
+    for _ in range(2):
+        assert torch.equal(A(x), Spect(grid, rig, mu=mu)(x))
+        mu.mul_(0.5)
+
+
+def test_an_operator_built_in_inference_mode_has_gradients():
+    grid, rig = Grid.centred(6, spacing=20.0), dcspect80(pixels=8, columns=[0], rows=[0])
+    with torch.inference_mode():
+        operators = [Spect(grid, rig), Spect(grid, rig, mu=0.01)]
+    x, y = torch.rand(1, 1, *grid.shape).double(), torch.rand(1, 1, 1, 8, 8).double()
+    for A in operators:
+        assert derivative_gap(A, x, y) < 1e-12

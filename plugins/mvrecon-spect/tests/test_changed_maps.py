@@ -1,8 +1,8 @@
 """Attenuation, and whatever is derived from it, follows every change of a map.
 
 Tried: memory of NumPy, `.numpy()` of a tensor, in-place operations, `.data`, an inference tensor,
-assignment, and the maps of cases; for whole rigs, subsets and blur, views, adjoints,
-networks in evaluation and training; and cameras that change after construction.
+assignment, the maps of cases, and compiled calls; for whole rigs, subsets and blur, views,
+adjoints, networks in evaluation and training; and cameras that change after construction.
 """
 
 from copy import deepcopy
@@ -102,9 +102,12 @@ def test_cases_with_maps_of_their_own_are_aligned_in_any_batch(monkeypatch):
     aligned |= {"alternations": 1, "iterations": 2}
     A, maps = Spect(GRID, RIG, mu="case"), torch.stack([body(), body(0.5), body().flip(2)])[:, None]
     y = A.for_case({"mu": maps})(torch.rand(3, 1, *GRID.shape))
+    y[:, :, ::2] = y[:, :, ::2].roll(1, -1)  # found, and not left as it is, which every map has
     y[2] = y[1]
     each = [A.for_case({"mu": maps[[i]]}) for i in range(3)]
     alone = [build_method(aligned)(y[[i]], B).volume for i, B in enumerate(each)]
+    apart = [build_method(aligned)(y[[i]], each[i]).alignment for i in (1, 2)]
+    assert (apart[0].shift_px - apart[1].shift_px).norm() > 0.01
     method = build_method(aligned).train()
     for batch in ([0, 1], [1, 2], [2, 0]):
         volume = method(y[batch], A.for_case({"mu": maps[batch]})).volume
@@ -118,6 +121,22 @@ def test_the_operator_of_a_case_knows_its_map_before_its_first_call():
     torch.compiler.reset()
     y = torch.compile(B, backend="eager")(x)
     torch.testing.assert_close(y, Spect(GRID, RIG, mu=body())(x))
+
+
+@pytest.mark.parametrize("change", ["in place", "NumPy", "assigned"])
+def test_a_map_of_zeros_that_is_filled_later_attenuates_in_compiled_graphs(change):
+    """Tried too: `.data`, and a map that was not zero at first."""
+    mu, x = torch.zeros(GRID.shape), torch.rand(1, 1, *GRID.shape)
+    A = Spect(GRID, RIG, mu=mu)
+    torch.compiler.reset()
+    compiled = torch.compile(A, backend="eager")
+    compiled(x)
+    for other in (body(), torch.zeros(GRID.shape), body(0.5)):
+        if change == "assigned":
+            A.A.mu = other
+        else:
+            FILLS[change](mu, other)
+        torch.testing.assert_close(compiled(x), Spect(GRID, RIG, mu=other)(x))
 
 
 def test_pinholes_of_a_changed_rig_are_refused():

@@ -11,6 +11,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid, placed, voxel_centres
 from mvrecon.operators.selection import view_subset
+from mvrecon.testing import gradient_gap
 from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.projector import Spect
 
@@ -384,6 +385,22 @@ def test_gradients_in_poses_are_complete(options, mu):
     slope, step = (gradient * direction).sum(), 1e-5
     difference = (loss(step * direction) - loss(-step * direction)) / (2 * step)
     assert slope.item() == pytest.approx(difference.item(), rel=1e-6)
+
+
+@pytest.mark.parametrize("name", ["source", "origin", "u", "v"])
+def test_gradients_in_one_vector_of_the_pose_are_complete(name):
+    """Of attenuated counts, by any of the tensors alone; also together with mu. Tried too: blur,
+    rectangular holes, voxels of any edges, oblique detectors, pixels that are not square.
+    """
+    torch.manual_seed(3)
+    grid, rig = Grid.centred(size=(4, 6, 5), spacing=9.0), some(14, 2.0)[[0, 2]]
+    x, mu = torch.rand(1, 1, *grid.shape).double(), 0.02 * torch.rand(grid.shape).double()
+
+    def counts(vector):
+        return Spect(grid, replace(rig, **{name: vector}), 4.0, mu=mu)(x)
+
+    vector = getattr(rig, name).clone().requires_grad_()
+    assert gradient_gap(counts, vector, step=1e-6) < 1e-6
 
 
 def test_gradients_in_attenuation_match_differences():

@@ -93,10 +93,10 @@ class Footprints(FixedGeometry):
         self.register_buffer("mu", None if matter is None else matter.mu, persistent=False)
         self.domain_shape, self.range_shape = grid.shape, (len(cameras), *cameras.shape)
         self.fine = grid
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():  # else no derivative could save them
             self.parts = parts_of(self._record(), grid)
-        self.fine = parted(grid, self.parts)
-        fixed = None if self.pose_gradient else self._record()
+            self.fine = parted(grid, self.parts)
+            fixed = None if self.pose_gradient else self._record()
         vectors = [getattr(cameras, name).detach().cpu() for name in VECTORS]
         self.poses = tuple(row.tobytes() for row in torch.cat(vectors, dim=1).numpy())
         self.register_buffer("fixed_rig", fixed, persistent=False)
@@ -107,10 +107,9 @@ class Footprints(FixedGeometry):
         return record_of(self.cameras, self.fine, self.hole, self.response)
 
     def _apply(self, fn, recurse: bool = True) -> "Footprints":
-        exact, clear = self.fixed_rig, self.clear
-        super()._apply(fn, recurse)
-        if exact is not None:  # keeps its precision
-            self.fixed_rig = exact.to(self.device)
+        exact, clear = (self.fixed_rig, self.mu), self.clear
+        super()._apply(fn, recurse)  # moves them, without loss of precision
+        self.fixed_rig, self.mu = (None if t is None else t.to(self.device) for t in exact)
         if self.mu is not None:  # known without synchronisation with a GPU
             kept(self.mu, "is zero", lambda: clear)
         return self
@@ -212,14 +211,14 @@ class Footprints(FixedGeometry):
 
     @property
     def clear(self) -> bool:
-        """Whether mu is zero everywhere and requires no gradient; as at the last call in graphs of
-        `torch.compile`.
+        """Whether mu is zero everywhere and requires no gradient; as at the last call in programs
+        of `torch.export`.
         """
         mu = self.mu
         if mu is None or mu.requires_grad:
             return mu is None
-        if not torch.compiler.is_compiling():
-            self.last_clear = kept(mu, "is zero", lambda: not bool((mu != 0).any()))
+        if not torch.compiler.is_exporting():
+            self.last_clear = _is_zero(mu)
         return self.last_clear
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
@@ -267,6 +266,14 @@ class Footprints(FixedGeometry):
             return None
         rays = ACROSS if pixel_in_voxels(self.cameras, self.grid) > 0.5 + 1e-6 else 1
         return PixelIntegral(self.hole.weight(self.cameras), rays)
+
+
+@torch.compiler.disable
+def _is_zero(mu: Tensor) -> bool:
+    """Whether a map is zero now, also between the graphs of `torch.compile`, which would keep the
+    answer of their first call.
+    """
+    return kept(mu, "is zero", lambda: not bool((mu != 0).any()))
 
 
 #: The operators by the reference.

@@ -45,7 +45,7 @@ def path_integrals(
     mu = to_accumulation_dtype(mu)
     fine = matter.refined(PARTS)
     frusta = [_frustum(fine, camera) for camera in cameras]
-    moving = mu.requires_grad or any(frustum.start.requires_grad for frustum in frusta)
+    moving = mu.requires_grad or any(frustum.along.requires_grad for frustum in frusta)
     small = math.prod(n + 2 for n in mu.shape) < 2**31  # as the loops count
     if mu.is_cpu and COMPILED and small and not (moving and torch.is_grad_enabled()):
         return _compiled(mu, frusta, grid)
