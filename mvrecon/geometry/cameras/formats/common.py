@@ -124,7 +124,7 @@ UNITS = {
     r"(\b|_|angle|theta|rotation)rad(ian)?s?\b": math.degrees(1),
     r"(?<![a-z])arc.?min": 1 / 60,
     r"(?<![a-z])arc.?sec": 1 / 3600,
-    r"(?<![a-z])(turns|revolutions|revs?)\b": 360.0,
+    r"[(\[](turns|revolutions)[)\]]": 360.0,
 }
 #: Names of the columns of angles in a table, among others.
 ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
