@@ -88,11 +88,11 @@ def better_rig(seen: "SomeViews") -> str | None:
     """
     if not seen.views.any():
         return None
-    stored = seen.rig(seen.cameras)
-    settled = seen.settled(stored)
+    settled = seen.settled(seen.cameras)
     before = _beyond(settled, seen.noise)
     if before < MAX_EXPLAINED:
         return None
+    stored = seen.rig(seen.cameras)
     contradicted = before > MIN_CONTRADICTION
     # of views cut at a side, as of a half fan, a slight shift may make up for coarse voxels
     slight = not seen.cut[1].any()
@@ -107,7 +107,7 @@ def better_rig(seen: "SomeViews") -> str | None:
         rigs += [both for rig in turned[:MAX_ARCS_ASIDE] for both in _shifted(seen, rig, far=True)]
     known = enumerate(rigs)  # their order decides among those that are equally good
     likely = sorted((r.nrmse, n, r) for n, r in known if r.nrmse < stored.nrmse)[:MAX_HYPOTHESES]
-    found = [(n, seen.settled(rig), rig) for _, n, rig in likely]
+    found = [(n, seen.settled(rig.cameras, rig.order), rig) for _, n, rig in likely]
     least = max(MAX_EXPLAINED, min((_beyond(left, seen.noise) for _, left, _ in found), default=0))
     best: list[tuple[float, Rig]] = []
     for _, left, rig in sorted(found):
@@ -261,9 +261,13 @@ class SomeViews(NamedTuple):
         """A hypothesis with its residual; raises as `squares`."""
         return Rig(cameras, self.squares(cameras, order=order), words, cure, order)
 
-    def settled(self, rig: Rig) -> float:
-        """The view NRMSE after `FINAL_ITERATIONS` iterations."""
-        return self.squares(rig.cameras, FINAL_ITERATIONS, rig.order).sum().sqrt().item()
+    def settled(
+        self, cameras: Cameras, order: tuple[bool, tuple[int, ...]] = STORED_ORDER
+    ) -> float:
+        """The view NRMSE of a hypothesis after `FINAL_ITERATIONS` iterations; raises as
+        `squares`.
+        """
+        return self.squares(cameras, FINAL_ITERATIONS, order).sum().sqrt().item()
 
 
 def noise_of(view: Float[Tensor, "1 v u"]) -> Float[Tensor, "1 i j"]:

@@ -289,9 +289,9 @@ def agreement(
     level = _relative(gain, ~unlike & ~blank).log()
     outlying = level.abs().amax(dim=1, keepdim=True) > MIN_OUTLYING_LOG_GAIN
     gain = torch.where(outlying & ~(unlike | blank), level, 0.0).exp()
+    if not views.is_cuda and not blank.any() and (gain == 1).all():
+        return Agreement(unlike, gain)  # no gain to try, no empty view to predict
     gain, fit = _consistent(A, views, gain, ~unlike & ~blank, weights)
-    if not views.is_cuda and not blank.any():
-        return Agreement(unlike, gain)
     y = views / gain[:, None, :, None, None]
     norms, expected = (torch.linalg.vector_norm(z, dim=(1, 3, 4)) for z in (y, fit))
     usual = norms.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values

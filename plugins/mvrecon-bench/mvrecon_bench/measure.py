@@ -18,6 +18,8 @@ Call = Callable[[], Any]
 Key = TypeVar("Key", bound=Hashable)
 #: A fast call is repeated up to this total time in seconds, or MORE times the requested number.
 WORTH_S, MORE = 0.2, 4
+#: Total time in seconds of the calls that are queued on a GPU.
+QUEUED_S = 0.15
 
 
 class Timing(NamedTuple):
@@ -79,7 +81,7 @@ def latency(call: Call, device: str, repeats: int = 3) -> float:
     return interleaved({0: call}, {0: once(call, device)[1]}, repeats, device)[0].ms
 
 
-def throughput(call: Call, device: str, seconds: float = 0.15) -> tuple[float, float]:
+def throughput(call: Call, device: str) -> tuple[float, float]:
     """Milliseconds per call for many queued calls, on the device and on the host (the overhead of
     Python).
     """
@@ -87,7 +89,7 @@ def throughput(call: Call, device: str, seconds: float = 0.15) -> tuple[float, f
     if not device.startswith("cuda"):
         return 1e3 * one, 1e3 * one
     one = once(call, device)[1]  # the first call may compile
-    count = max(2, min(300, int(seconds / max(one, 1e-6))))
+    count = max(2, min(300, int(QUEUED_S / max(one, 1e-6))))
     begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     wait(device)
     begin.record()
