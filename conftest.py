@@ -6,7 +6,6 @@ It is every test of the folders and files of FAST, less those of APART and those
 import gc
 import itertools
 import os
-import pickle
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -23,8 +22,7 @@ from tests.covering import covering_array, takes_long
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-ROOT = Path(__file__).parent
-TESTS = ROOT / "tests"
+TESTS = Path(__file__).parent / "tests"
 FAST = [
     TESTS / place
     for place in (
@@ -114,33 +112,6 @@ def nothing_waits_for_the_disk() -> Iterator[None]:
     """No test cuts the power: a killed process loses nothing that it has written."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
-        yield
-
-
-@pytest.fixture(autouse=True, scope="session")
-def choices_are_read_once() -> Iterator[None]:
-    """Hydra parses each file of the project's choices at its first command, not at every one: that
-    takes a quarter of a command. The files of a test's own folder are read each time.
-    """
-    from hydra._internal.config_repository import ConfigRepository
-    from hydra.core.object_type import ObjectType
-
-    load = ConfigRepository.load_config
-    kept: dict[tuple[Path, str, int], bytes] = {}
-
-    def loaded(repository: ConfigRepository, config_path: str) -> Any:
-        source = repository._find_object_source(config_path, ObjectType.CONFIG)
-        ours = source and source.scheme() == "file" and Path(source.path).is_relative_to(ROOT)
-        if not ours:
-            return load(repository, config_path)
-        file = Path(source.path, source._normalize_file_name(config_path))
-        key = file, config_path, file.stat().st_mtime_ns
-        if key not in kept:
-            kept[key] = pickle.dumps(load(repository, config_path))
-        return pickle.loads(kept[key])  # else overrides would change what the next command reads
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ConfigRepository, "load_config", loaded)
         yield
 
 
