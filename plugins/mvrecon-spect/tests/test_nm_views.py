@@ -17,6 +17,8 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.formats.common import from_world
+from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.nm import read_frames, read_nm
 from tests.data.nm_files import in_time, item, study
 
@@ -398,6 +400,10 @@ def test_the_extent_of_rotation_of_interfile_is_that_of_the_cameras(tmp_path: Pa
     for unequal in (ANGLES, (*turn[:4], turn[5], turn[4])):
         with pytest.warns(UserWarning, match="60 or 72 degrees .* 'extent of rotation' 360 of 6"):
             scan(path, rig(*unequal))
+    for world in ("LPS", "IEC"):  # with another axis of rotation
+        InterfileViews(path).check_rig(from_world(rig(*turn), world))
+        with pytest.raises(Refused, match="'extent of rotation' 360 of 6 .*, got 30 to 30"):
+            InterfileViews(path).check_rig(from_world(rig(*(a / 2 for a in turn)), world))
     path = interfile(tmp_path / "b.hs", 9.0, "extent of rotation := 0")
     scan(path, rig(*ANGLES))
 

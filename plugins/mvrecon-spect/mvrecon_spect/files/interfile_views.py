@@ -61,10 +61,10 @@ class InterfileViews(ProjectionStack):
         super().check_rig(cameras)
         if self.n_views < 2 or self._arc == 0:
             return
-        got, count = turned(cameras), self.n_views
+        got, count = turned(cameras, cameras.v.sum(dim=0)), self.n_views  # rows lie along the axis
         known = [self._arc / count, self._arc / (count - 1)]
         stated = got.new_tensor([sign * step for step in known for sign in (1, -1)])
-        index = torch.arange(count, dtype=got.dtype)
+        index = torch.arange(count, dtype=got.dtype, device=got.device)
         if apart(got, stated[:, None] * index).amax(dim=1).min() <= MAX_ANGLE:
             return
         steps = (got.diff() + 180) % 360 - 180

@@ -83,13 +83,16 @@ class NmViews(ProjectionStack):
 
     def check_rig(self, cameras: Cameras) -> None:
         """Compare also the detectors' angles about the z axis with those of the views, except for
-        an angle in common; see `turned`.
+        an angle in common.
+
+        Convention: with z towards the head, angles increase from the patient's back (-y) to the
+        left (-x), as in DICOM.
         """
         super().check_rig(cameras)
         angles = [angle for angle in self._angles if angle is not None]
         if len(angles) < len(self._angles):
             return
-        got = turned(cameras)
+        got = turned(cameras, cameras.u.new_tensor([0.0, 0.0, -1.0]))
         stated = (got.new_tensor(angles) - angles[0]) % 360
         off = apart(got, stated)
         if off.max() > MAX_ANGLE:

@@ -1,6 +1,7 @@
-"""Angles of a rig's detectors about the z axis, compared with those that a file states."""
+"""Angles of a rig's detectors about an axis, compared with those that a file states."""
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -10,16 +11,15 @@ from mvrecon.geometry.cameras.camera import Cameras
 MAX_ANGLE = 1.0
 
 
-def turned(cameras: Cameras) -> Float[Tensor, " m"]:
-    """Angle in degrees, 0 to 360, by which the detector of each camera is turned from the first.
-
-    Convention: with z towards the head, angles increase from the patient's back (-y) to the left
-    (-x), as in DICOM.
+def turned(cameras: Cameras, axis: Float[Tensor, " 3"]) -> Float[Tensor, " m"]:
+    """Angle in degrees, 0 to 360, by which the detector of each camera is turned from the first,
+    counter-clockwise seen from the tip of the axis.
     """
     normal = torch.linalg.cross(cameras.u, cameras.v)
     normal = normal * ((cameras.origin - cameras.source) * normal).sum(-1, keepdim=True).sign()
-    angles = torch.rad2deg(torch.atan2(-normal[:, 0], -normal[:, 1]))
-    return (angles - angles[0]) % 360
+    first = normal[0] - normal[0] @ axis * axis / axis.square().sum()
+    ahead = torch.linalg.cross(F.normalize(axis, dim=0), first)
+    return torch.rad2deg(torch.atan2(normal @ ahead, normal @ first)) % 360
 
 
 def apart(first: Tensor, second: Tensor) -> Tensor:
