@@ -157,11 +157,10 @@ def hdf5_views(
     if not h5py.is_hdf5(path):
         raise Refused(f"{path}: not an HDF5 file, or cut short; expected {EXPECTED}")
     with held(), file_errors(path, "cannot be read as HDF5"):
-        if dataset is angles is image_key is None:
-            place = followed(path, "/views")
-            if place is not None and texts_at([place], "unit"):
+        if dataset is None and (place := followed(path, "/views")) is not None:
+            if angles is image_key is None and texts_at([place], "unit"):
                 return Hdf5Views(path)
-            dataset = None if place is None else "/views"  # of another program
+            dataset = "/views"  # of another program
         places = _Layout.of(path, dataset, layout == "sinogram")
         if angles is not None:
             places = places._replace(angles=named(path, angles))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, shown, text_of
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import Key, check_keys, has_effect
 from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -19,6 +19,8 @@ from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureBiasValue")
 #: Those of them that are stored as numerator and denominator.
 RATIOS = ("FNumber", "ExposureBiasValue")
+#: Items of GDAL that scale values: the role, and the number.
+SCALED = re.compile(r"<Item\b[^>]*\brole\s*=\s*[\"'](scale|offset)[\"'][^>]*>\s*([^<]*?)\s*<")
 #: Tags of TIFF that change the pixels or their order.
 TIFF_KEYS = (
     Key("BitsPerSample", "applied", "also gives the largest grey value"),
@@ -117,9 +119,15 @@ def tiff_header(file: Path) -> Header:
             head = _page_header(file, page, images)
             stated.append({name: texts[0] for name, texts in head.stated.items()})
             if head._replace(stated=first.stated) != first:
+                name = next(
+                    name
+                    for name in ("words", *Header._fields)
+                    if name != "stated" and getattr(head, name) != getattr(first, name)
+                )
+                wanted, got = (getattr(one, name) for one in (first, head))
+                what = "" if name == "words" else f"{name} "
                 raise Refused(
-                    f"{file}: expected {first.words} on every page, got {head.words} on page "
-                    f"{page.index}"
+                    f"{file}: expected {what}{wanted} on every page, got {got} on page {page.index}"
                 )
             numbers.append(page.tags.valueof("PageNumber"))
         if len(stated) != len(pages):  # iteration ends where a page is not readable
@@ -252,7 +260,8 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
             return described.get(entry)
         found = page.tags.valueof(tag)
         if tag == "GDAL_METADATA":
-            return found if re.search(r"role=.(scale|offset)\b", str(found or "")) else None
+            items = SCALED.findall(str(found or ""))
+            return [f"{role} {value}" for role, value in items if has_effect(role, value)]
         return int(found) if isinstance(found, int) else found  # tifffile's are enumerations
 
     check_keys(file, TIFF_KEYS, value_of)

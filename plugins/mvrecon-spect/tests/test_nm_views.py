@@ -17,6 +17,8 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.cameras import files
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.formats.common import from_world
+from mvrecon_spect.files.interfile_views import InterfileViews
 from mvrecon_spect.files.nm import read_frames, read_nm
 from tests.data.nm_files import in_time, item, study
 
@@ -379,6 +381,30 @@ def test_pixels_of_interfile_are_those_of_the_cameras(pixel_mm, tmp_path: Path):
     with pytest.raises(Refused, match=rf"file's pixels of {down:g} x {right:g} mm .*got 2 x 1.5"):
         scan(path, rig(*ANGLES))
     path.write_text(text.replace(f"[1] := {right}", "[1] := 0"))
+    scan(path, rig(*ANGLES))
+
+
+def test_the_extent_of_rotation_of_interfile_is_that_of_the_cameras(tmp_path: Path):
+    """Cameras of a part of the extent, of a multiple, or in another order; both directions, any
+    zero, and an extent that ends at the last view or behind it are right. 0 states nothing.
+    Cameras of several heads or rings, whose extent may be that of each, are warned of.
+    """
+    turn = [60.0 * k for k in range(6)]
+    path = interfile(tmp_path / "a.hs", 9.0, "extent of rotation := 360", "start angle := 180")
+    for right in (turn, turn[::-1], [77 - angle for angle in turn], [a + 0.4 for a in turn]):
+        scan(path, rig(*right))
+    scan(path, rig(*(72.0 * k for k in range(6))))
+    for wrong in ([a / 2 for a in turn], [2 * a for a in turn], [0.0] * 6):
+        with pytest.raises(Refused, match="60 or 72 degrees .* 'extent of rotation' 360 of 6 pr"):
+            scan(path, rig(*wrong))
+    for unequal in (ANGLES, (*turn[:4], turn[5], turn[4])):
+        with pytest.warns(UserWarning, match="60 or 72 degrees .* 'extent of rotation' 360 of 6"):
+            scan(path, rig(*unequal))
+    for world in ("LPS", "IEC"):  # with another axis of rotation
+        InterfileViews(path).check_rig(from_world(rig(*turn), world))
+        with pytest.raises(Refused, match="'extent of rotation' 360 of 6 .*, got 30 to 30"):
+            InterfileViews(path).check_rig(from_world(rig(*(a / 2 for a in turn)), world))
+    path = interfile(tmp_path / "b.hs", 9.0, "extent of rotation := 0")
     scan(path, rig(*ANGLES))
 
 

@@ -173,7 +173,7 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
         **{"DetectorRoll": 0.5, "SourceOffsetX": 2, "ObjectOffsetZ": 3, "ImageRotation": 90},
         **{"RotationDirection": "CW", "FlipHorizontal": "True", "AngularUnits": "rad"},
         **{"PixelBinning": 2, "HelixPitch": 10, "ZStep": 0.3, "ConveyorSpeed": 5},
-        "ScanType": "Helical",
+        **{"ScanType": "Helical", "IncrementalAngle": -60, "StartAngle": 90},
     }.items():
         with pytest.warns(UserWarning, match=f"ignored the entries {name.lower()}={value}"):
             nikon.read(xtekct(tmp_path, **{name: value}))

@@ -129,6 +129,30 @@ def test_every_tag_to_refuse_is_refused_by_name(key, tmp_path):
         open_projections(written(tmp_path / "a.tif", values, **options))
 
 
+@pytest.mark.parametrize("mark", ['"', "'"])
+def test_only_items_of_gdal_that_scale_values_are_refused(mark, tmp_path):
+    """GDAL writes both items if one of them is set, and others beside them."""
+    text = '<Item name="SCALE" sample="0" role="scale">{}</Item><Item name="OFFSET" sample="0" '
+    text += 'role="offset">{}</Item><Item name="scale">3</Item><Item role="unittype">m</Item>'
+    for scale, offset, got in ((0.5, 0, "scale 0.5"), (1, -5, "offset -5"), (2, 1, "offset 1")):
+        text_of = text.format(scale, offset).replace('"', mark).replace("role=", "role = ")
+        tags = [(42112, "s", 0, f"<GDALMetadata>{text_of}</GDALMetadata>", True)]
+        with pytest.raises(Refused, match=f"no GDAL_METADATA, got .*{got}"):
+            open_projections(written(tmp_path / "a.tif", grey()[0], extratags=tags))
+    for scale, offset in ((1, 0), ("1.0", "0.000")):
+        tags = [(42112, "s", 0, text.format(scale, offset).replace('"', mark), True)]
+        stack = open_projections(written(tmp_path / "a.tif", grey()[0], extratags=tags))
+        assert np.array_equal(stack.read(0, 1)[0], grey()[0])
+
+
+def test_what_differs_between_pages_is_named(tmp_path):
+    """A description of the first page alone, as stacks of a detector's images have it."""
+    path, text = tmp_path / "a.tif", "# Pixel_size 172e-6 m x 172e-6 m\n# Exposure_time 1 s\n"
+    tifffile.imwrite(path, grey()[:2].astype("i4"), description=text, metadata=None)
+    with pytest.raises(Refused, match=r"pixel_mm \(0.172.*\) on every page, got None on page 1"):
+        open_projections(path)
+
+
 @pytest.mark.parametrize("last", [1, 2])
 def test_images_of_several_exposure_times_are_warned_of(last, tmp_path):
     """As cameras write it in EXIF's tags."""

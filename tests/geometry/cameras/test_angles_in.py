@@ -24,6 +24,17 @@ FORMS = {
     "m.csv": "Bild;Angle (°)\n" + "\n".join(f"{k};{a}" for k, a in enumerate(ANGLES)),
     "n.csv": f"Angle (°)\n{COLUMN}",  # in Latin-1, as programs of Windows write it
     "o.txt": f"# degrees, from radians; by Conrad, at the radius 3\n{COLUMN}  # rad\n",
+    **{
+        f"comment {k}.txt": f"# {words}\n{COLUMN}\n"
+        for k, words in enumerate(
+            (
+                *("gradient", "3 turns", "in 3 turns", "(2 turns)", "two turns", "turns: 3"),
+                *("grad student", "by a grad student", "rad. dose", "dose / rad. unit", "rev 2"),
+                *("Rev. B", "(rev B)", "version: rev 3", "step of 0.5 mrad", "scan (0.2 rad wide)"),
+                *("in deg, not in radians", "rotation of 3 revolutions", "Paragon stage"),
+            )
+        )
+    },
     "p.csv": f"Radiography: angle\n{COLUMN}",
     "f.tsv": "view\trotation\n" + "\n".join(f"{k}\t{a}" for k, a in enumerate(ANGLES)),
 }
@@ -51,6 +62,12 @@ REFUSED = {
     "radians in a name of two words": ("Angle (rad)\n" + COLUMN, "expected degrees"),
     "three turns in radians by numpy.savetxt": ("# theta (rad)\n0\n18.85\n", "multiply by 57.29"),
     "a comment below another": ("# of July\n# theta [rad]\n0\n3\n", "'of July theta .rad.'"),
+    "radians, not degrees": ("# in radians, not in degrees\n0\n18.85\n", "multiply by 57.29"),
+    "radians beside a step": ("# step 0.5 deg; unit: rad\n0\n18.85\n", "multiply by 57.29"),
+    "radians with a formula": ("# theta in rad (deg * pi / 180)\n0\n18.85\n", "by 57.29"),
+    "radians alone": ("# radians, clockwise\n0\n18.85\n", "multiply by 57.29"),
+    "turns alone": ("# turns\n0\n0.5\n", "multiply by 360"),
+    "gon behind in": ("# Winkel in gon der Anlage\n0\n300\n", "multiply by 0.9"),
     "milliradians": ("theta_mrad\n0\n300\n", "multiply by 0.0572"),
     "arc minutes": ("angle (arcmin)\n0\n300\n", "multiply by 0.01666667"),
     "arc seconds": ("angle / arc sec\n0\n300\n", "multiply by 0.0002777"),

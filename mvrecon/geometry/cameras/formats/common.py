@@ -116,16 +116,21 @@ def number_lines(path: str | Path) -> list[list[float]]:
     return lines
 
 
-#: Units in the names of angles, in degrees; the first that is found counts.
+#: Units of angles, in degrees.
 UNITS = {
-    "(?<![a-z])deg|°": 1.0,
-    r"(?<![a-z])m(illi.?)?rad(ian)?s?\b": math.degrees(1e-3),
-    r"(?<![a-z])(grad(ian)?s?|gon)\b": 0.9,
-    r"(\b|_|angle|theta|rotation)rad(ian)?s?\b": math.degrees(1),
-    r"(?<![a-z])arc.?min": 1 / 60,
-    r"(?<![a-z])arc.?sec": 1 / 3600,
-    r"[(\[](turns|revolutions)[)\]]": 360.0,
+    "deg(rees?)?|°": 1.0,
+    "m(illi.?)?rad(ian)?s?": math.degrees(1e-3),
+    "grad(ian)?s?|gon": 0.9,
+    "rad(ian)?s?": math.degrees(1),
+    "arc.?min(ute)?s?": 1 / 60,
+    "arc.?sec(ond)?s?": 1 / 3600,
+    "turns|rev(olution)?s?": 360.0,
 }
+#: A unit as a name or a comment states it: alone, in brackets, behind an angle, a mark or "in"; not
+#: as a quantity ("3 turns"), nor as another word ("rad. dose", "rev 2", "grad student").
+STATED = (
+    r"(^|_|[(\[:=/]|\bin|angles?|theta|rotation)\s*({0})\s*(\.?$|[)\],;(])|\bin\s+({0})(?![\w.])"
+)
 #: Names of the columns of angles in a table, among others.
 ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
 
@@ -144,8 +149,12 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
         Refused: not one column of finite numbers, another unit, or too many.
     """
     name, angles = numbers_in(path, "angles", ANGLE_NAMES)
-    degrees = (by for unit, by in UNITS.items() if re.search(unit, name, re.IGNORECASE))
-    if (factor := next(degrees, 1.0)) != 1:
+    units = [
+        (stated.start(), degrees)
+        for unit, degrees in UNITS.items()
+        if (stated := re.search(STATED.format(unit), name, re.IGNORECASE))
+    ]
+    if (factor := min(units, default=(0, 1.0))[1]) != 1:  # the first of several
         raise Refused(f"{path}: expected degrees, got {shown(name)}; multiply by {factor:.7g}")
     with file_errors(path, "has no angles", "expected one number per line, or a table"):
         check_degrees(angles, small_arc, "angles")

@@ -137,10 +137,14 @@ CONTENT: dict[Content, tuple[Key, ...]] = {
         Key("scatter corrected", "refused", "counts as measured", NO),
         Key("applied corrections", "refused", "counts as measured", ("none", "{none}", "{}")),
         Key(
-            "direction of rotation, start angle, extent of rotation, "
-            "first projection angle in data set",
+            "direction of rotation, start angle, first projection angle in data set",
             "compared",
-            "with a ring of STIR's detector file",
+            "with a ring of STIR's detector file; programs differ in the zero and the direction",
+        ),
+        Key(
+            "extent of rotation",
+            "compared",
+            "as they are; also with the steps of other cameras, either way round",
         ),
         Key("orbit", "refused", "", ("circular",)),
         Key("radius", "applied", "of STIR's pinhole systems"),

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_image import DicomImage
@@ -12,10 +11,10 @@ from mvrecon.data.projections.images import ImageFiles
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon_spect.files.nm import EnergyWindow, Frame, View, read_frames
+from mvrecon_spect.files.turning import MAX_ANGLE, apart, turned
 
-#: Degrees by which the angle of a camera may differ from that of its view, and relative difference
-#: of durations, for rounding.
-MAX_ANGLE, MAX_DURATION = 1.0, 1e-3
+#: Relative difference of durations for rounding.
+MAX_DURATION = 1e-3
 
 
 def dicom_views(path: Path, dataset: str | None = None) -> ProjectionStack:
@@ -93,11 +92,9 @@ class NmViews(ProjectionStack):
         angles = [angle for angle in self._angles if angle is not None]
         if len(angles) < len(self._angles):
             return
-        normal = torch.linalg.cross(cameras.u, cameras.v)
-        normal = normal * ((cameras.origin - cameras.source) * normal).sum(-1, keepdim=True).sign()
-        got = torch.rad2deg(torch.atan2(-normal[:, 0], -normal[:, 1]))
-        stated, got = ((a - a[0]) % 360 for a in (got.new_tensor(angles), got))
-        off = ((got - stated + 180) % 360 - 180).abs()
+        got = turned(cameras, cameras.u.new_tensor([0.0, 0.0, -1.0]))
+        stated = (got.new_tensor(angles) - angles[0]) % 360
+        off = apart(got, stated)
         if off.max() > MAX_ANGLE:
             k = int(off.argmax())
             raise Refused(
