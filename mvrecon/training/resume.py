@@ -284,10 +284,10 @@ def report_checkpoint(last: Path) -> Iterator[None]:
     try:
         yield
     except SIGTERMException as stop:
-        raise SystemExit(f"Stopped by SIGTERM. {_kept(last)}") from stop
+        raise SystemExit(f"Stopped by SIGTERM; {_kept(last)}") from stop
     except SystemExit as stop:
         if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning ends the process itself
-            raise SystemExit(f"Stopped by Ctrl-C. {_kept(last)}") from stop
+            raise SystemExit(f"Stopped by Ctrl-C; {_kept(last)}") from stop
         raise
     except Exception as error:
         if last.exists() or previous(last).exists():
@@ -306,8 +306,8 @@ def _kept(last: Path) -> str:
     run = last.parents[2]
     checkpoint = next((path for path in (last, previous(last)) if path.exists()), None)
     if checkpoint is None:
-        return f"There is no checkpoint yet: mvrecon-train resume={run} starts again"
-    return f"The last good checkpoint is {checkpoint}: mvrecon-train resume={run} resumes it"
+        return f"there is no checkpoint yet: mvrecon-train resume={run} starts again"
+    return f"the last good checkpoint is {checkpoint}: mvrecon-train resume={run} resumes it"
 
 
 def extended(settings: TrainSettings, folder: Path, steps: int) -> TrainSettings:

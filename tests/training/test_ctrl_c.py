@@ -17,7 +17,7 @@ def test_ctrl_c_reports_how_to_resume(kept: bool, tmp_path: Path):
     if kept:
         last.touch()
     then = "resumes it" if kept else "starts again"
-    message = f"Stopped by Ctrl-C. .*mvrecon-train resume={run} {then}"
+    message = f"Stopped by Ctrl-C; .*mvrecon-train resume={run} {then}"
     with pytest.raises(SystemExit, match=message), report_checkpoint(last):
         try:
             raise KeyboardInterrupt

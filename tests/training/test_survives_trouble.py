@@ -16,17 +16,17 @@ pytestmark = pytest.mark.long
 SINGLE = {
     "term": (
         {"what": "term", "n": 8, "app": True},
-        "Stopped by SIGTERM. The last good checkpoint is",
+        "Stopped by SIGTERM; the last good checkpoint is",
         8,
     ),
     "closed terminal": (
         {"what": "hang up", "n": 8, "app": True},
-        "Stopped by SIGTERM. The last good checkpoint is",
+        "Stopped by SIGTERM; the last good checkpoint is",
         8,
     ),
     "judged": (
         {"what": "term in validation", "n": 3},
-        "Stopped by SIGTERM. The last good checkpoint is",
+        "Stopped by SIGTERM; the last good checkpoint is",
         9,
     ),
     "disk": (
@@ -46,7 +46,7 @@ WORKERS = {
     "worker": ({"what": "dead worker", "n": 12}, "exited unexpectedly with exit code 3", None),
     "job": (
         {"what": "term of a job", "n": 8},
-        "Stopped by SIGTERM. The last good checkpoint is",
+        "Stopped by SIGTERM; the last good checkpoint is",
         8,
     ),
 }
@@ -68,7 +68,7 @@ def test_each_failure_is_reported_with_a_non_zero_exit(troubled):
     """
     folder, cases, ended = troubled
     for name, (_, message, _) in cases.items():
-        life, note = ended[name][0], "The last good checkpoint is"
+        life, note = ended[name][0], "the last good checkpoint is"
         assert life["exit"] == 1, name
         lines = life["said"].splitlines()
         assert any(message.format(run=folder / name) in line for line in lines), (
