@@ -25,6 +25,9 @@ spect as (
 corrupted as (
   select method, avg(psnr) as psnr from [experiments/29_ray_weights/classical.csv] where faults like '%rod%' group by method
 ),
+longer as (
+  select avg(a.psnr - b.psnr) as lead from [experiments/29_ray_weights/aligned.csv] a join [experiments/29_ray_weights/aligned.csv] b on b.[case] = a.[case] and b.seed = a.seed where a.method = 'cross_view from robust_sirt, narrow' and b.method = 'world_unet from robust_sirt, narrow' group by a.[case] having count(*) = 3
+),
 starts as (
   select views, avg(seconds) as seconds, count(*) as count, sum(degrees < 1 and mm < 1) as found
   from [experiments/31_registration/starts.csv] where part = 'mvrecon' group by views
@@ -41,6 +44,7 @@ select
   printf('is %.1f dB behind cross-view with camera weights and reweighted SIRT',
     (select avg(psnr) from measured where method = 'cross_view, reweight=12' and seed = 0 and steps = 1000)
     - (select avg(psnr) from measured where method = 'world_unet' and steps = 4400)),
+  (select printf('cross-view leads by %.1f +- %.1f dB (three seeds', avg(lead), 2 * stdev(lead) / sqrt(count(lead))) from longer),
   (select printf('leads by %.2f +- %.2f dB', avg(lead), 2 * stdev(lead) / sqrt(count(lead))) from patients),
   (select printf('cross-view %+.2f +- %.2f dB, but a larger error in the heart', avg(lead), 2 * stdev(lead) / sqrt(count(lead)))
     from spect having avg(heart) > 0)

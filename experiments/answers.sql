@@ -107,6 +107,7 @@ union all select printf('%.1f dB behind it after 800', max(psnr) filter (where m
   from (select method, avg(psnr) as psnr from (select method, rate, seed, avg(psnr) as psnr from [experiments/26_published/tuning.csv] where steps = 800 group by method, rate, seed) group by method, rate)
 union all select printf('after 4000 steps %.1f dB (three seeds', avg(a.psnr - b.psnr)) from [experiments/29_ray_weights/longer.csv] a join [experiments/29_ray_weights/longer.csv] b
   on b.[case] = a.[case] and b.seed = a.seed and b.method = 'world_unet from robust_sirt, narrow' where a.method = 'cross_view from robust_sirt, narrow'
+union all select printf('and %.1f dB on aligned views', avg(a.psnr - b.psnr)) from [experiments/29_ray_weights/aligned.csv] a join [experiments/29_ray_weights/aligned.csv] b on b.[case] = a.[case] and b.seed = a.seed where a.method = 'cross_view from robust_sirt, narrow' and b.method = 'world_unet from robust_sirt, narrow'
 union all select printf('by %.0f to %.0f in the log-likelihood', min(lead), max(lead)) from ahead
 union all select printf('`robust_sirt`, %.1f dB ahead of SIRT', lead) from robust
 union all select printf('%.1f dB ahead of `world_unet` if both start from SIRT', lead) from networks where method = 'cross_view'
