@@ -23,7 +23,7 @@ from mvrecon.apps.config import choices, compose, conf_dir, help_text, texts_of
 from mvrecon.apps.config.errors import sentence
 from mvrecon.apps.config.grammar import CommandLine
 from mvrecon.apps.settings import RECORDS, TrainSettings
-from mvrecon.core import options as core_options, registry, signatures
+from mvrecon.core import options as core_options, parts as core_parts, registry
 from mvrecon.core.registry import GROUP, import_plugins
 from mvrecon.training.targets import instantiate
 
@@ -389,7 +389,7 @@ def rig(path: str, turns: int = 1):
     parts = {"projector.lab": "Lab", "camera.lab": "rig", "head.lab": "Head", "method.lab": "gone"}
     points = [EntryPoint(name, f"lab_parts:{part}", GROUP) for name, part in parts.items()]
     known = registry.installed()
-    for module in (registry, signatures, choices):
+    for module in (registry, core_parts, choices):
         monkeypatch.setattr(module, "installed", lambda: (*known, *points))
     yield
     for name in parts:

@@ -4,7 +4,6 @@ cameras alike.
 """
 
 import math
-import re
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -336,12 +335,6 @@ class Hdf5Views(ProjectionStack):
             self.attenuated = _truth(path, views, "attenuated")
             if (axes := _text(path, views, "axes")) not in (None, AXES):
                 raise Refused(f"{path}: expected the axes {AXES!r} of views, got {shown(axes)}")
-            if re.search(r"^counts$| of | \* mm$", self.unit or "counts") is None:
-                raise Refused(
-                    f"{path}: expected views in a unit of mvrecon-simulate, such as '1/mm * mm', "
-                    f"'spect of activity' or 'counts', got {shown(self.unit)}; for views of "
-                    f"another program, remove the attribute, and say kind (views.kind)"
-                )
             if self.unit != "counts" and (got := {"dose", "unit_per_dose"} & {*views.attrs}):
                 raise Refused(
                     f"{path}: expected a {sorted(got)[0]} of views in the unit 'counts' alone, got "

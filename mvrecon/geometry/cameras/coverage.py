@@ -252,7 +252,7 @@ def check_coverage(
     Args:
         cameras: the rig.
         grid: the voxels.
-        remedy: advice that ends the warning, where a detector would do.
+        remedy: advice that ends the warning.
         bodies: true volumes of the first cases.
 
     Warns:
@@ -269,13 +269,11 @@ def check_coverage(
         words += f"; of the mass of the first {len(bodies)} case(s), {judged[-1]}"
     if not any(share.poor > MAX_POOR_SHARE for share in judged):
         return
-    warnings.warn(f"{words}. {_advice(cameras, grid, remedy)}", stacklevel=2)
+    warnings.warn(f"{words}. {_advice(cameras, grid)}; {remedy}", stacklevel=2)
 
 
-def _advice(cameras: Cameras, grid: Grid, remedy: str) -> str:
-    """The detector that sees the grid's inscribed cylinder, in words, and the remedy; or why no
-    detector does.
-    """
+def _advice(cameras: Cameras, grid: Grid) -> str:
+    """The detector that sees the grid's inscribed cylinder, in words."""
     rows, columns = cameras.shape
     try:
         v, u = covering_pixels(cameras, grid)
@@ -286,7 +284,7 @@ def _advice(cameras: Cameras, grid: Grid, remedy: str) -> str:
     mm = " x ".join(f"{_rounded_up(factor * step):g}" for step in pitch)
     return (
         f"Its inscribed cylinder needs a detector of {math.ceil(v)} x {math.ceil(u)} pixels (rows "
-        f"x columns) at this pitch, or {rows} x {columns} pixels of {mm} mm; {remedy}"
+        f"x columns) at this pitch, or {rows} x {columns} pixels of {mm} mm"
     )
 
 

@@ -195,22 +195,6 @@ def test_a_source_inside_of_the_grid_has_no_fitting_detector():
         fitted(camera, PATIENT)
 
 
-def test_a_fitted_detector_is_not_advised_where_none_fits():
-    """Of a grid around its sources, which no number of pixels sees."""
-    rig = CAMERAS.from_config(
-        {
-            "name": "circular",
-            "n_views": 4,
-            "sid": 400.0,
-            "sdd": 600.0,
-            "detector": {"pixels": [8, 8], "pixel_mm": 20.0},
-        }
-    )
-    with pytest.warns(UserWarning, match="No detector of this rig sees the whole") as warned:
-        check_coverage(rig, Grid.centred(8, spacing=200.0))
-    assert "fit" not in str(warned[0].message)
-
-
 def test_rigs_from_files_take_a_fitted_detector_where_it_does_not_move_them(tmp_path):
     """A table of angles and RTK's geometry; not matrices, which have each pixel in its place."""
     rig = circular(12, 1000.0, 1500.0, {"pixels": [48, 48], "pixel_mm": 10.0})
