@@ -25,10 +25,20 @@ from mvrecon.methods.calibration.self_alignment import self_aligned
 from mvrecon.methods.method import build_method
 
 CORRUPTED = {"views": 3, "rod": 0.25, "scatter": 0.15, "dead": 0.08, "probability": 0.5}
-MISALIGNED = {"shift_px": 1.0, "gain": 0.05, "tilt_deg": 3.0, "motion_mm": 20.0}
-MISALIGNED |= {"views": 3, "probability": 0.5}
-FAULTS = {"corrupted": CORRUPTED, "misaligned": MISALIGNED, "lost": MISALIGNED | {"lost": 1}}
-FAULTS["clean"] = None
+MISALIGNED = {
+    "views": 3,
+    "shift_px": 1.0,
+    "gain": 0.05,
+    "tilt_deg": 3.0,
+    "motion_mm": 20.0,
+    "probability": 0.5,
+}
+FAULTS = {
+    "clean": None,
+    "corrupted": CORRUPTED,
+    "misaligned": MISALIGNED,
+    "lost": MISALIGNED | {"lost": 1},
+}
 BATCH, RANGE = 4, 0.04
 PATIENTS, HELD_OUT = 170, range(150, 170)
 GRID = mv.Grid.centred(size=(16, 16, 16), spacing=(32.0, 20.0, 24.0))

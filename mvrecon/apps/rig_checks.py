@@ -52,9 +52,9 @@ MIN_OFFSET_PX, MIN_COARSE_OFFSET_PX, MIN_STANDARD_ERRORS = 1.0, 0.1, 4.0
 #: relative to it.
 ARCS_DEGREES, MAX_ARCS_ASIDE = (360, 180, 210, 240, 270, 300, 330), 3
 MAX_STEP_DEVIATION, MIN_ARC_CHANGE = 0.02, 0.05
-#: Wrong angles leave at most so many times what varies between views: over half a turn, views of
-#: a small object at r from the axis have it aside by r / sqrt(2), of which their mean may have
-#: 2 r / pi.
+#: Greatest residual that wrong angles leave, relative to the variation between views: over half a
+#: turn, a small object at a distance r from the axis is off-centre by r / sqrt(2) in its views
+#: (root mean square), and by up to 2 r / pi in their mean.
 MAX_LEFT_BY_ANGLES = (0.5 / (0.5 - 4 / math.pi**2)) ** 0.5
 #: Size of the grid for views that end inside the object, relative to theirs.
 EXTENDED_GRID_FACTOR = 1.5
@@ -97,7 +97,7 @@ def better_rig(seen: "SomeViews") -> str | None:
     # of views cut at a side, as of a half fan, a slight shift may make up for coarse voxels
     slight = not seen.cut[1].any()
     axis = _shifted(seen, stored, contradicted) if contradicted or slight else []
-    # a body of revolution fits any angles, which have no part in what all views share
+    # angles do not affect the part that all views share: a body of revolution fits any
     by_angles = before <= MAX_LEFT_BY_ANGLES * seen.variation
     turned = _turned(seen) if contradicted and by_angles else []
     rigs = [*axis, *(_oriented(seen) if contradicted else ()), *turned]

@@ -89,11 +89,7 @@ DICOM_KEYS = (
         "DICOM-CT-PD's: cameras are flat; convert the views to those of a flat detector",
         ("FLAT",),
     ),
-    Key(
-        ", ".join(PIXELS),
-        "compared",
-        "DICOM-CT-PD's, with Rows and Columns",
-    ),
+    Key(", ".join(PIXELS), "compared", "DICOM-CT-PD's, with Rows and Columns"),
     *ONE_FILE,
     Key("AppliedMaskSubtractionFlag", "refused", "grey values, not differences", ("NO",)),
     Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),

@@ -82,7 +82,7 @@ class ProjectionStack(ABC):
         dtype: type of the pixels as they are stored.
 
     Raises:
-        Refused: no view or too many, or pixels that are no numbers or truth values.
+        Refused: no view or too many, or pixels that are neither numbers nor truth values.
     """
 
     #: Kind of the pixels if the format defines it.

@@ -123,8 +123,8 @@ def covering_pixels(cameras: Cameras, grid: Grid) -> tuple[float, float]:
     """Return the least number of rows and columns, as fractions, with which every detector about
     its present centre sees the grid's inscribed cylinder along z, in pixels of the present pitch.
 
-    One slice is seen by a fan: its rim counts in its plane, and its thickness on its axis, as the
-    part of the rim that is near a source would take a second row.
+    A grid of one slice needs a fan beam: its rim counts in its plane alone, and its thickness on
+    its axis, since the part of the rim nearest to a source would need a second row.
 
     Raises:
         ValueError: a source within the cylinder, or behind which a part of it lies.

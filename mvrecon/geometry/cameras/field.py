@@ -97,9 +97,9 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
 
     The box extends along x, y and z through the isocentre as far as the field, to a quarter of a
     voxel, and so contains what all views see whole. Fewer views may see its corners: of cones, at a
-    distance r from the axis, all see 1 - r / SID of its height. The box has the field's centre,
-    which is beside the isocentre where more views see one side, such as a part of a helix's. The
-    voxel is the finest pixel's pitch, demagnified to the isocentre.
+    distance r from the axis, all see 1 - r / SID of its height. The box is centred on the
+    field, which is beside the isocentre where more views see one side, as for a part of a helix.
+    The voxel is the finest pixel's pitch, demagnified to the isocentre.
 
     Args:
         cameras: the rig.
