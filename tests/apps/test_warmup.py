@@ -40,6 +40,8 @@ def test_the_last_line_says_where_kernels_are(place, tmp_path, monkeypatch, run_
     tried: a package on a read-only disk, with and without a home that can be written.
     """
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    said = run_python("-c", WHERE, place).stdout
+    run = run_python("-c", WHERE, place)
+    assert "Warning" not in run.stderr, run.stderr
+    said = run.stdout
     expected = {"beside": "mvrecon/kernels", "user": f"in {tmp_path}", "nowhere": "are not kept"}
     assert expected[place] in said and ("kept in" in said) == (place != "nowhere"), said

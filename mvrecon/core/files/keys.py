@@ -4,7 +4,8 @@ consults and that `docs/file_formats.md` shows.
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -45,12 +46,32 @@ EFFECTS = {
 }
 
 
+#: Unknown keys that a warning names.
+NAMED = 8
+
+
 def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> bool:
     """Whether a key that a format's reader does not know may change what it reads: its name has a
     word of `effects`, and its value is not the one that changes nothing.
     """
     neutral = [none for words, none in effects.items() if re.search(words, name, re.IGNORECASE)]
     return bool(neutral) and _plain(value) != _plain(neutral[-1])
+
+
+def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:
+    """Warn, in one line, of keys that a format's reader does not know, and ignores.
+
+    Args:
+        path: path of the file, or of the folder of a set of files.
+        names: names of the unknown keys; of none there is no warning.
+    """
+    if unknown := list(dict.fromkeys(names)):
+        more = f" and {len(unknown) - NAMED} others" if len(unknown) > NAMED else ""
+        warnings.warn(
+            f"{path}: ignores keys that mvrecon does not know: {', '.join(unknown[:NAMED])}{more}; "
+            f"if one changes values or geometry, apply it to the file first",
+            stacklevel=3,
+        )
 
 
 def section_entries(path: str | Path) -> Iterator[tuple[str, str, str]]:
