@@ -19,7 +19,7 @@ from dataclasses import replace
 from mvrecon.apps.command_line import command_line
 from mvrecon.apps.config.errors import one_line
 
-#: Voxels along an edge, pixels along a detector's, and views: as few as every kernel and method needs.
+#: Voxels along an edge, pixels along a detector's, and views: few, but without streaks.
 VOXELS, PIXELS, VIEWS = 8, 8, 16
 #: Voxels and pixels along an edge from which on empty parts of a volume are looked for.
 MIN_SKIP_VOXELS, MIN_SKIP_PIXELS = 32, 512
