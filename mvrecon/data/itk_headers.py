@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.core.files import checks
-from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect
+from mvrecon.core.files.keys import EFFECTS, Key, check_keys, check_unknown, warn_of_unknown
 
 #: Maximum bytes of a header.
 HEADER = 2**16
@@ -20,8 +20,33 @@ HEADER = 2**16
 LINE = 500
 #: Lengths are mm, which ITK takes all to be: NRRD's and MetaImage's unknown units.
 NO_UNIT = ("", "?")
-#: Keys of MetaImage (.mha, .mhd), all applied by ITK but where noted. A key that differs from one
-#: of them in case or spaces alone is refused: ITK ignores it.
+#: Keys of other formats that ITK copies into MetaImage, and into NRRD as key/value pairs.
+COPIED = (
+    Key("????|????", "ignored", "of DICOM, by group and element; ITK applied them"),
+    Key(
+        "scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, bitpix, "
+        "vox_offset, nifti_type, qform_code*, sform_code*, qfac, qoffset_*, quatern_*, srow_*, "
+        "toffset, cal_min, cal_max, intent_*, slice_*, descrip, aux_file",
+        "ignored",
+        "of NIfTI; ITK applied them",
+    ),
+    Key("dimension_order, storage_data_type", "ignored", "of MINC; ITK applied them"),
+    Key(
+        "NRRD_kinds[*], NRRD_centerings[*], NRRD_labels[*], NRRD_thicknesses[*], NRRD_space, "
+        "NRRD_content, NRRD_measurement frame",
+        "ignored",
+        "of NRRD; ITK applied them",
+    ),
+    Key("ITK_*, CompressionLevel, Software, Modality", "ignored", "of ITK"),
+    Key(
+        "DICOM.*, Segmentation_*, Segment*_*, MultiVolume.*, DWMRI_*, vtkMRML*, MITK*, "
+        "org_mitk_*, modality",
+        "ignored",
+        "of 3D Slicer and MITK",
+    ),
+)
+#: Keys of MetaImage (.mha, .mhd), all applied by ITK but where noted. ITK ignores one whose name
+#: differs in case or spaces.
 META_KEYS = (
     Key("ObjectType", "refused", "", ("Image",)),
     Key("FileFormatVersion", "refused", "newer versions place images by ElementOrigin", (0,)),
@@ -55,9 +80,13 @@ META_KEYS = (
         "applied",
         "LOCAL, or one file in the header's folder or below; no LIST or pattern",
     ),
-    Key("ElementMin, ElementMax, Modality, SequenceID", "ignored", "statistics and origin"),
+    Key(
+        "ElementMin, ElementMax, SequenceID, Comment, Name, ID, ParentID, Color, AcquisitionDate",
+        "ignored",
+        "statistics and origin",
+    ),
     Key("ObjectSubType, TransformType", "ignored", "of other objects than images"),
-    Key("toffset", "ignored", "NIfTI's time, which ITK copies with other keys of its header"),
+    *COPIED,
 )
 #: Numbers of a key of MetaImage, as a power of the number of axes.
 COUNTS = {
@@ -75,12 +104,15 @@ REPEATED = (
     ("ElementSpacing", "ElementSize"),
     ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
 )
-#: Words of unknown keys of MetaImage that change values or places; see `EFFECTS`.
+#: Words of unknown keys that change values or places; see `EFFECTS`. ITK does not apply the units
+#: and quantization of an NRRD, but copies them.
 META_EFFECTS = {
     **EFFECTS,
     "angle|euler|rotat|tilt|shear|direction|quaternion|matrix|affine|transform|translat|origin|"
     "axes|(?<!patient)(orient|position)": 0,
     "spacing|(voxel|pixel).?size|^skip|data.?offset": None,
+    "^NRRD_.*units": "mm",
+    "^NRRD_old": math.nan,
 }
 #: MetaImage's types, and numpy's.
 META_TYPES = {
@@ -133,9 +165,10 @@ NRRD_KEYS = (
     Key("measurement frame", "ignored", "of vectors"),
     Key("number, content, labels", "ignored", "repeated by sizes, and texts"),
     Key("min, max, thicknesses", "ignored", "statistics, and extent of a voxel"),
+    *COPIED,
 )
 #: All fields of NRRD without blanks, which ITK's reader accepts as well.
-FIELDS = {name.replace(" ", "") for key in NRRD_KEYS for name in key.names}
+FIELDS = {name.replace(" ", "") for key in NRRD_KEYS if key not in COPIED for name in key.names}
 
 
 class Header(NamedTuple):
@@ -154,7 +187,7 @@ class Header(NamedTuple):
 
 def meta_header(path: Path, text: str) -> Header:
     entries, first = _meta_entries(path, text)
-    check_keys(path, META_KEYS, lambda key: _collapsed(entries.get(key, "")))
+    check_keys(path, META_KEYS, entries.get)
     numbers = _counted(path, entries)
     if (kind := entries.get("ElementType", "")) not in META_TYPES:
         raise checks.Refused(
@@ -198,8 +231,8 @@ def meta_header(path: Path, text: str) -> Header:
 def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
     """Keys and texts of a MetaImage's header as ITK splits it, and the bytes of the header."""
     known = [name for key in META_KEYS for name in key.names]
-    folded = {name.lower(): name for name in known}
     entries: dict[str, str] = {}
+    pairs: list[tuple[str, str]] = []
     place = 0
     while "ElementDataFile" not in entries:
         line, end, _ = text[place:].partition("\n")
@@ -213,25 +246,13 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
         if found is None:
             continue
         name, value = found.groups()
-        near = folded.get(re.sub("[^a-z]", "", name.lower()), name)
-        if near != name:
-            raise checks.Refused(f"{path}: expected {near}, got {name!r}, which ITK ignores")
+        pairs.append((name, value))
         if name in known and entries.setdefault(name, value) != value:
             raise checks.Refused(
                 f"{path}: expected one {name}, got {checks.shown([entries[name], value])}"
             )
-        _check_unknown(path, name, value, known)
+    check_unknown(path, pairs, META_KEYS, META_EFFECTS)
     return entries, place
-
-
-def _check_unknown(path: Path, name: str, value: str, known: Sequence[str]) -> None:
-    """Raise for an unknown key of MetaImage with a word of `META_EFFECTS`, as in RescaleSlope."""
-    plain = re.fullmatch("[A-Za-z][A-Za-z0-9]*", name) and name not in known
-    if plain and has_effect(name, _collapsed(value), META_EFFECTS):
-        raise checks.Refused(
-            f"{path}: expected keys of MetaImage whose effect is known, got {name} "
-            f"{checks.shown(value)}; apply it, and remove the key"
-        )
 
 
 def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
@@ -266,12 +287,6 @@ def _truth(path: Path, name: str, text: str) -> bool:
     if text.lower() not in TRUTH:
         raise checks.Refused(f"{path}: expected {name} True or False, got {checks.shown(text)}")
     return TRUTH[text.lower()]
-
-
-def _collapsed(text: str) -> str:
-    """The word that a text repeats, as 0 of "0 0 0", else the text."""
-    words = text.split()
-    return words[0] if len(set(words)) == 1 else text
 
 
 def _check_repeated(path: Path, entries: Mapping[str, str], values: Mapping[str, Any]) -> None:
@@ -386,8 +401,8 @@ def nrrd_header(path: Path, text: str) -> Header:
 
 
 def _word(entries: Mapping[str, str], key: str) -> str:
-    """The word that a field repeats, without quotation marks."""
-    return _collapsed(entries.get(key.replace(" ", ""), "")).strip('"')
+    """The text of a field, without quotation marks."""
+    return entries.get(key.replace(" ", ""), "").strip('"')
 
 
 def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
@@ -399,6 +414,7 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
         raise checks.Refused(f"{path}: expected an NRRD header of at most {HEADER} bytes")
     count = lines.index("")
     entries: dict[str, str] = {}
+    pairs: list[tuple[str, str]] = []
     for line in lines[1:count]:
         name, between, value = line.partition(": ")
         name = name.lower().replace(" ", "")
@@ -410,6 +426,11 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
             )
         if between and name in FIELDS:  # ITK refuses unknown and repeated ones
             entries.setdefault(name, value.strip())
+        elif ":=" in line and not line.startswith("#"):
+            pairs.append((line.partition(":=")[0], line.partition(":=")[2]))
+    alike = [pair for pair in pairs if pair[0].lower().replace(" ", "") in FIELDS]
+    warn_of_unknown(path, [f"{name}:=" for name, _ in alike])  # no fields, whatever their names
+    check_unknown(path, [pair for pair in pairs if pair not in alike], NRRD_KEYS, META_EFFECTS)
     return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
 
 

@@ -3,6 +3,8 @@
 import gzip
 import logging
 import math
+import re
+import struct
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import Key, check_keys, has_effect, warn_of_unknown
 from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled, storable
 from mvrecon.geometry.grid import Grid
 
@@ -56,7 +58,16 @@ KEYS = (
     Key("magic", "refused", "header and values in one file", ("n+1", "n+2")),
     Key("cal_min, cal_max", "ignored", "display alone"),
     Key("intent_code, dim_info, slice_code, toffset", "ignored", "not of values or places"),
+    Key(
+        "descrip, intent_name, aux_file, header extensions",
+        "ignored",
+        "a warning of texts such as slope=2 or 1/cm, and of extensions of unknown codes",
+    ),
 )
+#: Fields of text, the code of an extension that is a comment, a statement in a text, and a unit.
+TEXTS, COMMENT_CODE = ("descrip", "intent_name", "aux_file"), 6
+STATEMENT = re.compile(r"([^\W\d][\w ]*?)(?: *[=:] *| +(?=[-+]?\.?\d))([^;,\s]+)")
+INVERSE_CM = re.compile(r"/ ?cm\b|\bcm ?\^? ?-1\b", re.IGNORECASE)
 #: Largest distance of a voxel's place by sform and by qform, in voxels.
 MAX_FORM_DISTANCE = 0.1
 #: Voxels along an axis that the header's 16-bit integers count.
@@ -70,9 +81,8 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
     """Open a NIfTI volume: values with slope and intercept applied, and the grid in world mm.
 
     Axes are permuted and reversed (without moving values) until x, y, z run roughly to the
-    patient's right, front and head; the grid's affine keeps any obliqueness. Header extensions are
-    ignored. Compressed files are read to their end, with the checksum; a plain .nii has none, so
-    damaged values go undetected.
+    patient's right, front and head; the grid's affine keeps any obliqueness. Compressed files are
+    read to their end, with the checksum; a plain .nii has none, so damaged values go undetected.
 
     Raises:
         ImportError: nibabel is not installed.
@@ -83,7 +93,8 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
 
     Warns:
         UserWarning: sform and qform of two codes differ, or sform and pixdim; neither form is
-            stated; or the file holds more than the volume it declares.
+            stated; the file holds more than the volume it declares; or a text or an extension of
+            the header may state a factor or a unit.
     """
     path = Path(path)
     checks.check_file(path, EXPECTED)
@@ -102,6 +113,7 @@ def open_nifti(path: str | Path) -> tuple[Slabs, Grid]:
                 f"vox_offset right?",
                 stacklevel=2,
             )
+        warn_of_unknown(path, _texts(path, header))
         affine = header.get_best_affine()
         _check_forms(path, header, shape)
         affine[:3] *= MILLIMETRES[int(header["xyzt_units"]) & LENGTH_BITS]
@@ -242,6 +254,29 @@ def _header(path: Path) -> Any:
         logger=SILENT_LOGGER, error_level=35
     )  # from a negative voxel size on; nibabel's other repairs are harmless
     return header
+
+
+def _texts(path: Path, header: Any) -> Iterator[str]:
+    """Texts of a header that may state a factor or a unit, and extensions of unknown codes."""
+    texts = [(name, header[name].item()) for name in TEXTS]
+    codes = checks.io_library("nibabel", path).nifti1.extension_codes.code
+    with _opened(path) as file:
+        raw = file.read(min(int(header["vox_offset"]), checks.MAX_TEXT_BYTES))
+    place = int(header["sizeof_hdr"]) + 4
+    extended = raw[place - 4]
+    while extended and place + 8 < len(raw):
+        size, code = struct.unpack_from(f"{header.endianness}2i", raw, place)
+        if code == COMMENT_CODE:
+            texts.append(("comment", raw[place + 8 : place + size]))
+        elif code not in codes:
+            yield f"extension of code {code}"
+        if size < 8:
+            break
+        place += size
+    for name, value in texts:
+        text = value.decode("latin-1").strip("\0 ")
+        if INVERSE_CM.search(text) or any(has_effect(*one) for one in STATEMENT.findall(text)):
+            yield f"{name} {checks.shown(text)}"
 
 
 def _check_fields(path: Path, header: Any) -> None:

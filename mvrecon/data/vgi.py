@@ -17,7 +17,14 @@ from mvrecon.core.files.checks import (
     plain_name,
     shown,
 )
-from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect, section_entries
+from mvrecon.core.files.keys import (
+    EFFECTS,
+    Key,
+    check_keys,
+    check_unknown,
+    has_effect,
+    section_entries,
+)
 from mvrecon.data.resample import Slab, Slabs, planes
 from mvrecon.geometry.grid import Grid
 
@@ -47,7 +54,14 @@ KEYS = (
     Key("scale", "refused", "resolution is that of the voxels", ("1 1 1",)),
     Key("file2.name", "refused", "all values in one file"),
     Key("center", "ignored", "of the rotation"),
-    Key("status, text", "ignored", "of the display"),
+    Key("status, text, clipbox", "ignored", "of the display"),
+    Key(
+        "[volume*], [description*], [version], [view*], [perspective*], [light*], [angle*], "
+        "[resolution*], [rendering*], [section*], [segment*], [histogram*], [scalebar*], [scene*], "
+        "[camera*], [clip*]",
+        "ignored",
+        "sections of the display",
+    ),
     Key("[calibration], [mapping]", "refused", "and sections of the like: apply what they state"),
 )
 
@@ -70,25 +84,27 @@ def _plain(text: str) -> str:
 def _entries(path: Path) -> dict[str, str]:
     """The entries of a .vgi by their sections, as `file1.size`.
 
+    Warns:
+        UserWarning: other unknown entries, and sections.
+
     Raises:
         Refused: several volumes, unknown entries that change values or geometry, or two sections
             that state other values.
     """
     entries: dict[str, str] = {}
+    pairs: list[tuple[str, str]] = []
     for section, name, value in section_entries(path):
         name = f"{section.strip('[]')}.{name}"
         alone = section == "[file1]" or name in ("geometry.resolution", "geometry.unit")
         if entries.setdefault(name, value) != value and alone:
             raise Refused(f"{path}: expected one volume, got the {name} {shown(value)} as well")
-        unknown = section in SECTIONS and name not in KNOWN and name.partition(".")[2] not in KNOWN
-        effect = unknown and has_effect(name, value, VGI_EFFECTS)
-        if section not in SECTIONS and has_effect(section, "", VGI_EFFECTS):  # [calibration]
-            effect = _plain(value).lower() not in NOTHING
-        if effect:
-            raise Refused(
-                f"{path}: expected keys of VGStudio whose effect is known, got {name} "
-                f"{shown(value)}; apply it, and remove the key"
-            )
+        if section not in SECTIONS:
+            if _plain(value).lower() not in NOTHING:
+                effect = has_effect(section, "", VGI_EFFECTS)  # [calibration] and the like
+                pairs.append((name if effect or not section else section, value))
+        elif name not in KNOWN and name.partition(".")[2] not in KNOWN:
+            pairs.append((name, value))
+    check_unknown(path, pairs, KEYS, VGI_EFFECTS)
     for name in ("size", "datarange", "datatype", "bitsperelement"):
         pair = [entries.get(f"{place}.{name}", "") for place in ("representation", "file1")]
         if pair[0] and " ".join(pair[0].lower().split()) != " ".join(pair[1].lower().split()):
@@ -172,7 +188,7 @@ def open_vgi(path: str | Path) -> tuple[Slabs, Grid]:
         skip = int(entries.get("file1.skipheader", "0") or 0)
     if not all(SPACING_MM[0] <= size <= SPACING_MM[1] for size in mm):
         raise Refused(f"{path}: expected voxels within {SPACING_MM} mm, got {mm}")
-    data = path.with_name(plain_name(entries.get("file1.name"), path))
+    data = path.with_name(plain_name(entries.get("file1.name", "").removeprefix("./"), path))
     check_file(data, f"the values of {path.name}")
     check_declared(path, (z, y, x), dtype.itemsize, data, skip)
     if (got := data.stat().st_size) != skip + x * y * z * dtype.itemsize:

@@ -54,7 +54,7 @@ def table() -> str:
         for key in keys:
             allowed = ", ".join(map(str, key.allowed))
             use = f"{key.use} unless {allowed}" if allowed else key.use
-            names = ", ".join(f"`{part}`" for part in key.name.split(", "))
+            names = ", ".join(f"`{part}`" for part in key.name.replace("|", r"\|").split(", "))
             rows.setdefault(f"{use}: {key.note}" if key.note else use, []).append(names)
         lines += [f"| {name} | {', '.join(names)} | {use} |" for use, names in rows.items()]
     return "\n".join([*lines, "", ""])

@@ -3,6 +3,7 @@ the file is refused by the key's name.
 """
 
 import gzip
+import warnings
 import zlib
 
 import numpy as np
@@ -233,6 +234,72 @@ def test_images_of_itk_in_any_direction_are_read_without_a_word(packed, ending, 
     for (k, j, i), value in np.ndenumerate(VALUES):
         x, y, z = image.TransformIndexToPhysicalPoint((i, j, k))
         assert found[-x, -y, z] == value
+
+
+@pytest.mark.parametrize(
+    ("write", "line", "key"),
+    [
+        (meta, "FooBar = 3", "FooBar"),
+        (meta, "0028-1053 = 2", "0028-1053"),
+        (meta, "private|key = 2", "private.key"),
+        (meta, "Density = 2", "Density"),
+        (meta, "modalitY = CT", "modalitY"),
+        (nrrd, "FooBar:=3", "FooBar"),
+        (nrrd, "old min:=0", "old min"),
+        (nrrd, "Space Directions:=(2,0,0)", "Space Directions"),
+        (nrrd, "reconstruction kernel:=bone", "reconstruction kernel"),
+    ],
+)
+def test_other_unknown_keys_are_named(write, line, key, tmp_path):
+    """Of MetaImage, and of the key/value pairs of NRRD, whatever their names."""
+    path = tmp_path / ("a.mha" if write is meta else "a.nrrd")
+    if write is meta:
+        meta(path, line)
+    else:
+        path.write_bytes(nrrd(path).read_bytes().replace(b"0005\n", f"0005\n{line}\n".encode()))
+    with pytest.warns(UserWarning, match=f"know: {key}") as found:
+        assert places(path) == (PLACED if write is meta else expected())
+    assert len(found) == 1
+
+
+@pytest.mark.parametrize("line", ["rescale slope:=2", "voxel size:=2", "space_origins:=(1,2,3)"])
+def test_pairs_of_nrrd_that_may_change_what_is_read_are_refused(line, tmp_path):
+    """As keys of MetaImage, into which ITK copies them. So are the units and the quantization of an
+    NRRD, which ITK copies without applying them.
+    """
+    path = nrrd(tmp_path / "a.nrrd")
+    path.write_bytes(path.read_bytes().replace(b"0005\n", f"0005\n{line}\n".encode()))
+    with pytest.raises(Refused, match=line.partition(":=")[0]):
+        read_volume(path)
+    for key in ("NRRD_space units[0] = cm", "NRRD_units[1] = cm", "NRRD_old min = 0"):
+        with pytest.raises(Refused, match=key.partition(" = ")[0].replace("[", ".")):
+            read_volume(meta(tmp_path / "a.mha", key))
+    with warnings.catch_warnings(action="error"):
+        lines = ["NRRD_space units[0] = mm", "NRRD_old min = nan"]
+        assert places(meta(tmp_path / "a.mha", *lines)) == PLACED
+
+
+@pytest.mark.parametrize("ending", ["mha", "mhd", "nrrd"])
+@pytest.mark.parametrize("source", ["nii", "dcm", "nrrd", "mnc", "tif", "vtk", "mha"])
+def test_images_that_itk_converts_are_read_without_a_warning(source, ending, tmp_path):
+    """With the keys of other formats that ITK copies, also where it converts them twice, and
+    with pairs of 3D Slicer.
+    """
+    image = sitk.GetImageFromArray(VALUES.astype("u2" if source in ("tif", "dcm") else "f4"))
+    image.SetMetaData("0028|1053", "2")
+    original, middle = tmp_path / f"a.{source}", tmp_path / f"b.{ending}"
+    sitk.WriteImage(image[:, :, :1] if source == "dcm" else image, str(original))
+    if source == "nrrd":
+        fields = 'kinds: domain domain domain\nlabels: "a" "b" "c"\nthicknesses: 1 1 1\n'
+        pairs = "Segmentation_ReferenceImageExtentOffset:=1 2 3\nDICOM.instanceUIDs:=1.2\n"
+        text = original.read_bytes().replace(b"kinds: domain domain domain\n", fields.encode())
+        original.write_bytes(text.replace(b"encoding", f"{pairs}encoding".encode(), 1))
+    sitk.WriteImage(sitk.ReadImage(str(original)), str(middle))
+    with warnings.catch_warnings(action="error"):
+        read_volume(middle)
+        for last in ("c.mha", "c.nrrd"):
+            sitk.WriteImage(sitk.ReadImage(str(middle)), str(tmp_path / last))
+            read_volume(tmp_path / last)
 
 
 def turned(degrees, axis, left_handed):

@@ -12,6 +12,42 @@ from mvrecon.data.volume_files import read_volume
 
 VALUES = np.arange(24, dtype="f4").reshape(4, 3, 2)  # [x y z]
 AFFINE = np.array([[1.0, 0, 0, 10], [0, 2, 0, 20], [0, 0, 3, 30], [0, 0, 0, 1]])
+#: Texts of a header, and extensions by their codes, with what a warning names.
+STATED = {
+    "a slope": ({"descrip": b"slope=2"}, [], "descrip"),
+    "a factor": ({"descrip": b"scale factor 0.5"}, [], "descrip"),
+    "a unit": ({"descrip": b"units: Bq/ml"}, [], "descrip"),
+    "1/cm": ({"intent_name": b"mu in 1/cm"}, [], "intent_name"),
+    "cm^-1": ({"descrip": b"attenuation (cm^-1)"}, [], "descrip"),
+    "an offset": ({"aux_file": b"offset=-1000"}, [], "aux_file"),
+    "a comment": ({}, [(6, b"rescale slope: 2")], "comment"),
+    "an unknown code": ({}, [(4, b"<AFNI scale=2>"), (98, b"x")], "extension of code 98"),
+    "FSL": ({"descrip": b"6.0.5:9e026117"}, [], ""),
+    "SPM": ({"descrip": b"SPM{T_[15.0]} - contrast 1: a"}, [], ""),
+    "dcm2niix": ({"descrip": b"TE=2.9;Time=113046.875;phase=1"}, [], ""),
+    "AFNI": ({}, [(4, b"<AFNI_attributes scale=2>"), (6, b"by hand")], ""),
+    "an identity": ({"descrip": b"slope=1;offset=0"}, [], ""),
+}
+
+
+@pytest.mark.parametrize("case", STATED)
+@pytest.mark.parametrize("kind", ["Nifti1Image", "Nifti2Image"])
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_texts_that_may_state_a_factor_or_a_unit_are_named(order, kind, case, tmp_path):
+    """Of a header of either byte order and version, packed or not; ordinary ones are not."""
+    fields, extensions, name = STATED[case]
+    header = getattr(nibabel, kind).header_class(endianness=order)
+    image = getattr(nibabel, kind)(VALUES, AFFINE, header)
+    for field, text in fields.items():
+        image.header[field] = text
+    image.header.extensions.extend(nibabel.nifti1.Nifti1Extension(*one) for one in extensions)
+    nibabel.save(image, tmp_path / "a.nii.gz")
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        read_volume(tmp_path / "a.nii.gz")
+    assert [name in str(one.message) for one in found] == [True] * bool(name)
+
+
 SFORM, QFORM, NEITHER = {"qform_code": 0}, {"sform_code": 0}, {"sform_code": 0, "qform_code": 0}
 
 

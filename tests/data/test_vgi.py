@@ -1,6 +1,8 @@
 """VGStudio's volumes."""
 
 import os
+import re
+import warnings
 
 import numpy as np
 import pytest
@@ -133,6 +135,44 @@ def test_a_volume_of_vgstudio_that_is_not_applied_is_refused(fault, tmp_path):
     changed, message = REFUSED[fault]
     with pytest.raises(Refused, match=message):
         read_volume(vgi(tmp_path, **changed))
+
+
+@pytest.mark.parametrize(
+    ("entry", "name"),
+    [
+        ({"file1__compression": "zip"}, "file1.compression"),
+        ({"representation__gamma": 2}, "representation.gamma"),
+        ({"geometry__shift": "1 0 0"}, "geometry.shift"),
+        ({"filter__kernel": 3, "filter__strength": 4}, "[filter]"),
+    ],
+)
+def test_other_unknown_entries_of_vgstudio_are_named(entry, name, tmp_path):
+    """One by one in the sections of values and geometry, else by their section."""
+    with pytest.warns(UserWarning, match=f"know: {re.escape(name)};") as found:
+        assert np.array_equal(read_volume(vgi(tmp_path, **entry))[0].numpy(), VALUES)
+    assert len(found) == 1
+
+
+def test_a_file_of_vgstudio_max_is_read_without_a_warning(tmp_path):
+    """With the sections of version 1.2's display, and the name as CERA's users write it."""
+    path = vgi(tmp_path, file1__Name="./a.vol", geometry__clipbox="0 0 0 4 3 2")
+    sections = {
+        "section1": "offset = 3",
+        "segment1": "redx = 0 65535",
+        "version": "release = 1.2.1",
+        "viewer": "position = 0 5849 0",
+        "perspective": "status = activated",
+        "light1": "diffuse = 0.3 0.3 0.3",
+        "angle": "right = 1 2 0",
+        "volume": "volume = volume1",
+        "resolution": "displayunit = mm",
+        "rendering": "intensity = 0.3",
+        "description": "text = a",
+    }
+    lines = (f"[{section}]\n{entry}" for section, entry in sections.items())
+    path.write_text("\n".join([path.read_text(encoding="utf-8"), *lines]), encoding="utf-8")
+    with warnings.catch_warnings(action="error"):
+        assert np.array_equal(read_volume(path)[0].numpy(), VALUES)
 
 
 def test_entries_of_vgstudio_that_change_nothing_are_accepted(tmp_path):

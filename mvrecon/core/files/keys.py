@@ -2,6 +2,7 @@
 consults and that `docs/file_formats.md` shows.
 """
 
+import difflib
 import math
 import re
 import warnings
@@ -16,7 +17,8 @@ class Key(NamedTuple):
     """A key of a format's header.
 
     Args:
-        name: the key as the format spells it, or several, separated by ", ".
+        name: the key as the format spells it, or several, separated by ", "; in one that is
+            ignored, "*" stands for any characters and "?" for one.
         use: "applied" to values or geometry; "compared" with what it repeats, and refused where it
             contradicts that; "refused" unless its value is one of `allowed`; or "ignored", for the
             reason in `note`.
@@ -48,14 +50,62 @@ EFFECTS = {
 
 #: Unknown keys that a warning names.
 NAMED = 8
+#: Values of an unknown key that state nothing.
+NOTHING = ("", "none", "unknown", "{}", "{none}")
+#: Similarity of letters, by `difflib`, from which an unknown key may be a misspelled known one.
+SLIP = 0.9
 
 
 def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> bool:
     """Whether a key that a format's reader does not know may change what it reads: its name has a
     word of `effects`, and its value is not the one that changes nothing.
     """
-    neutral = [none for words, none in effects.items() if re.search(words, name, re.IGNORECASE)]
+    neutral = _neutral(name, effects)
     return bool(neutral) and _plain(value) != _plain(neutral[-1])
+
+
+def _neutral(name: str, effects: Mapping[str, Any]) -> list[Any]:
+    return [none for words, none in effects.items() if re.search(words, name, re.IGNORECASE)]
+
+
+def check_unknown(
+    path: str | Path,
+    stated: Iterable[tuple[str, str]],
+    keys: Sequence[Key],
+    effects: Mapping[str, Any] = EFFECTS,
+) -> None:
+    """Check the keys of a header that are not in the table of its format: those that may change
+    what is read are refused, and one warning names the others, unless their values state nothing
+    or, as a slope of 1, change nothing.
+
+    Args:
+        path: path of the file.
+        stated: keys of the header with their values.
+        keys: table of the format.
+        effects: words of unknown keys that change what is read; see `EFFECTS`.
+
+    Raises:
+        Refused: an unknown key with one of these words and a value that has an effect, or with the
+            name of a known key but for a typing error; the message names it.
+    """
+    names = [(name, key) for key in keys for name in key.names]
+    patterns = (re.escape(name).replace(r"\*", ".*").replace(r"\?", ".") for name, _ in names)
+    known = re.compile("|".join(patterns))
+    used = {_letters(name): name for name, key in names if key.use != "ignored"}
+    unknown = [
+        (name, value)
+        for name, value in stated
+        if not known.fullmatch(name) and value.strip().lower() not in NOTHING
+    ]
+    for name, value in unknown:
+        near = difflib.get_close_matches(_letters(name), used, n=1, cutoff=SLIP)
+        if near or has_effect(name, value, effects):
+            slip = f"; did you mean {used[near[0]]}? Else" if near else ";"
+            raise Refused(
+                f"{path}: expected keys whose effect is known, got {name} {shown(value)}{slip} "
+                f"apply it, and remove the key"
+            )
+    warn_of_unknown(path, [name for name, _ in unknown if not _neutral(name, effects)])
 
 
 def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:
@@ -70,7 +120,7 @@ def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:
         warnings.warn(
             f"{path}: ignores keys that mvrecon does not know: {', '.join(unknown[:NAMED])}{more}; "
             f"if one changes values or geometry, apply it to the file first",
-            stacklevel=3,
+            stacklevel=2,  # one place for every caller, so that Python shows it once
         )
 
 
@@ -115,9 +165,17 @@ def _missing(value: Any) -> bool:
     return value is None or (hasattr(value, "__len__") and len(value) == 0)
 
 
+def _letters(name: str) -> str:
+    """The letters of a name, without those of its section (`file1.size`)."""
+    return re.sub(r"[\W\d_]", "", name.lower().rpartition(".")[2])
+
+
 def _plain(value: Any) -> Any:
-    """A finite number where there is one, else text in lower case."""
-    text = str(value).strip().lower()
+    """The word that a text repeats, as 0 of "0 0 0", else the text, in lower case; a finite number
+    where there is one.
+    """
+    words = str(value).lower().split()
+    text = words[0] if len(set(words)) == 1 else " ".join(words)
     try:
         return float(text) if math.isfinite(float(text)) else text
     except ValueError:

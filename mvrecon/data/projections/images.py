@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file, check_link, file_errors, shown
-from mvrecon.core.files.keys import Key
+from mvrecon.core.files.keys import Key, warn_of_unknown
 from mvrecon.data.dicom_image import DICOM, ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures, rtk_images
@@ -129,6 +129,9 @@ class ImageFiles(ProjectionStack):
     Args:
         files: the views' files, in their order, which for a set is that of its description.
 
+    Warns:
+        UserWarning: keys that the reader does not know.
+
     Raises:
         Refused: images of several sizes or types, colours, a file that is damaged, or one with a
             key to refuse (`TIFF_KEYS`, `PNG_KEYS`, `DICOM_KEYS`).
@@ -160,6 +163,7 @@ class ImageFiles(ProjectionStack):
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
         where = files[0] if len(files) == 1 else files[0].parent
+        warn_of_unknown(where, (name for head in headers for name in head.unknown))
         pages = [(f, k) for f, head in zip(files, headers, strict=True) for k in range(head.pages)]
         order = _order_of(where, [place for head in headers for place in head.own], len(pages))
         self.stated = {}

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_declared, io_library
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect
 from mvrecon.data.projections.exposures import number_of
 from mvrecon.data.projections.stack import Header
 
@@ -49,7 +49,11 @@ EDF_KEYS = (
     Key(", ".join(EDF_TIMES), "compared", "of views and flat fields, as ExposureTime, from s"),
     Key("counter_mne, counter_pos", "compared", "the ring's current srcur, as ExposureTime"),
     Key("optic_used", "ignored", "of no stated unit; the pixel size is asked for"),
+    Key("image_flip, image_rotation", "ignored", "of the camera, which applied them"),
 )
+#: Words of unknown keys of EDF that change values, of which a reader warns; see `EFFECTS`.
+EDF_EFFECTS = {**EFFECTS, "background|flat.?field|dark|normali|correct|subtract|raster|log": 0}
+EDF_KNOWN = {name.lower() for key in EDF_KEYS for name in key.names}
 HIS_KEYS = (
     Key("FileType, HeaderSize", "applied", "of version 100"),
     Key("ULX, ULY, BRX, BRY", "refused", "equal rows and columns: RTK takes one for the other"),
@@ -85,8 +89,9 @@ def rtk_header(file: Path) -> Header:
     form = ENDINGS[file.suffix.lower()]
     kind, sized = PIXELS[form]
     stated: dict[str, list[str]] = {}
+    unknown: list[str] = []
     if form == "EDF":
-        kind, stated = _check_edf(file)
+        kind, stated, unknown = _check_edf(file)
     elif form == "HIS":
         _check_his(file)
     elif form == "XIM":
@@ -107,7 +112,9 @@ def rtk_header(file: Path) -> Header:
     dtype = np.dtype(kind)
     top = None if dtype.kind == "f" else float(np.iinfo(dtype).max)
     pixel = (down, right) if sized else None
-    return Header((rows, columns), dtype, pages, frozenset([top]), pixel, stated=stated)
+    return Header(
+        (rows, columns), dtype, pages, frozenset([top]), pixel, stated=stated, unknown=unknown
+    )
 
 
 def rtk_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
@@ -136,9 +143,9 @@ def _itk(file: Path) -> Any:
     return itk
 
 
-def _check_edf(file: Path) -> tuple[str, dict[str, list[str]]]:
-    """The type of the pixels, and the exposure by the names in the header; raises Refused for
-    `EDF_KEYS` to refuse.
+def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
+    """The type of the pixels, the exposure by the names in the header, and unknown keys that may
+    change values; raises Refused for `EDF_KEYS` to refuse.
     """
     with file.open("rb") as raw:
         text = raw.read(EDF_HEADER)
@@ -165,7 +172,12 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]]]:
     numbers = (number_of(text, f"{file}: {name}") for name, text in times.items())
     exposed = {f"{1000 * time:.6g}" for time in numbers if time is not None}
     texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
-    return kind, {name: [text] for name, text in texts.items() if text}
+    unknown = [
+        f"{name}={value}"
+        for name, value in stated.items()
+        if name not in EDF_KNOWN and has_effect(name, value, EDF_EFFECTS)
+    ]
+    return kind, {name: [text] for name, text in texts.items() if text}, unknown
 
 
 def _check_his(file: Path) -> None:

@@ -2,6 +2,8 @@
 
 import errno
 import os
+import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -548,8 +550,59 @@ OF_RECONSTRUCTIONS = [
     ],
 )
 def test_keys_without_effect_are_accepted(header: str, line: str, tmp_path: Path):
-    """Keys of STIR 6, GATE, SIMIND, XMedCon and Siemens, with values that change nothing."""
-    assert np.array_equal(read(tmp_path, header, line), VALUES.astype("f4"))
+    """Keys of STIR 6, GATE, SIMIND, XMedCon and Siemens, with values that change nothing, without a
+    warning.
+    """
+    with warnings.catch_warnings(action="error"):
+        assert np.array_equal(read(tmp_path, header, line), VALUES.astype("f4"))
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        *((f"{name} := 2", name) for name in ("sharpened", "%secret", "counts", "Bq/ml [2]")),
+        *(("kernel = 3", "kernel"), ("keV: 3", "kev")),
+        *(("just a remark", "just a remark"), ("slop := 2", "slop")),
+    ],
+)
+@pytest.mark.parametrize("header", [IMAGE, ATTMAP, VIEWS])
+def test_other_unknown_keys_are_named(header: str, line: str, name: str, tmp_path: Path):
+    """In one warning, also lines that state no key."""
+    with pytest.warns(UserWarning, match=f"know: {re.escape(name.lower())}") as found:
+        assert np.array_equal(read(tmp_path, header, line), VALUES.astype("f4"))
+    assert len(found) == 1
+
+
+def test_an_image_of_castor_is_read_without_a_warning(tmp_path: Path):
+    """Its keys, a dynamic image of one frame, a heading without `:=`, and lines of the input's
+    header behind the end.
+    """
+    lines = [
+        *("!type of data := Dynamic", "!number of frame groups := 1", "process status :="),
+        *("CASToR version := 3.2", "!STATIC STUDY (General) :=", "!GENERAL IMAGE DATA"),
+        *("!number of images in this frame group := 4", "!image start time (sec) := 0"),
+        *("pause between frame groups (sec) := 0", "data rescale slope := 1"),
+    ]
+    read(tmp_path, ATTMAP, *lines)
+    path = tmp_path / "a.hv"
+    behind = "!COPY OF INPUT HEADER 1\nData type: PET\nScatter correction flag: 0\n"
+    path.write_text(f"{path.read_text()}\n{behind}")
+    with warnings.catch_warnings(action="error"):
+        assert np.array_equal(read_interfile(path)[0], VALUES)
+
+
+def test_headings_and_origins_of_other_programs_are_read_without_a_warning(tmp_path: Path):
+    """Of GATE, SIMIND and (X)MedCon."""
+    lines = [
+        *("date of keys := 1992:01:01", "program author := M Ljungberg", "exam type := STATIC"),
+        *("original institution := a", "contact person := b", "!study ID := c", "patient sex := M"),
+        *("!static study (each frame) :=", "!image number := 1", "label := View1"),
+        *("GATE SIMULATION :=", "crystal material := NaI", "number of runs := 32"),
+        *("conversion program := (X)MedCon", "study time := 09:40:47"),
+    ]
+    for header in (SLICES, ATTMAP, VIEWS):
+        with warnings.catch_warnings(action="error"):
+            assert np.array_equal(read(tmp_path, header, *lines), VALUES)
 
 
 @pytest.mark.parametrize("header", [IMAGE, ATTMAP])

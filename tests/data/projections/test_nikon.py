@@ -175,16 +175,33 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
         **{"PixelBinning": 2, "HelixPitch": 10, "ZStep": 0.3, "ConveyorSpeed": 5},
         **{"ScanType": "Helical", "IncrementalAngle": -60, "StartAngle": 90},
     }.items():
-        with pytest.warns(UserWarning, match=f"ignored the entries {name.lower()}={value}"):
+        with pytest.warns(UserWarning, match=f"know: {name.lower()}={value};"):
             nikon.read(xtekct(tmp_path, **{name: value}))
     own = {"OffsetZ": 4, "Scaling": 1000, "OutputUnits": "/m", "TIFFScaling": 1, "Scale": 1.32}
     own |= {"AutomaticCentreOfRotation": 1, "AutoScalingType": 2, "ImportConversion": 1}
     own |= {"InvertedImages": "False", "Angles": "Equidistant"}
-    own |= {"FluxNormalisation": 0, "FramesPerProjection": 4}
+    own |= {"FluxNormalisation": 0, "FramesPerProjection": 4, "Increment": 1, "OrderFFT": 3}
+    own |= {"VirtualDetectorPixelsX": 6, "SrcToVirtualDetector": 400.0, "Blanking": 0}
+    own |= {"AutomaticCentreOfRotationMaskRadius": 3.0, "OperatorID": "a", "OutputDigits": 4}
     with warnings.catch_warnings(action="error"):
         for none in ("", "none", "NONE"):
             own |= {"AngleFile": none}
             nikon.read(xtekct(tmp_path, **own, BlackLevel=0, Conveyor="False", DetectorTilt=""))
+
+
+def test_entries_of_ctpro_count_as_those_of_the_scan(tmp_path):
+    """Those of how images were taken: shuttling is refused, and a file of angles named."""
+    path = xtekct(tmp_path, Shuttling=None)
+    own = path.read_text("latin-1")
+    path.write_text(f"{own}Shuttling=True\r\n", "latin-1")
+    with pytest.raises(Refused, match="expected Shuttling"):
+        nikon.read(path)
+    path.write_text(f"{own}AngleFile_Use=True\r\n", "latin-1")
+    with pytest.warns(UserWarning, match="anglefile_use=True"):
+        nikon.read(path)
+    path.write_text(f"{own}AngleFile_Use=False\r\nVoxelScalingFactor=2\r\n", "latin-1")
+    with warnings.catch_warnings(action="error"):
+        nikon.read(path)
 
 
 @pytest.mark.parametrize(

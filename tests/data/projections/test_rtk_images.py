@@ -255,8 +255,34 @@ def test_times_of_edf_that_are_no_numbers_are_warned_of(text, tmp_path):
     path = tmp_path / "a.edf"
     edf(path, grey(20_000)[0].astype("u2"), count_time=text, acq_expo_time=0.02)
     with pytest.warns(UserWarning, match=f"a.edf: count_time: .*got '{text}'; it is not used"):
-        _, stated = rtk_images._check_edf(path)
+        _, stated, _ = rtk_images._check_edf(path)
     assert stated == {"ExposureTime": ["20"]}
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("gain", 2), ("DataOffset", 100), ("FlatField", "Corrected"), ("Units", "1/mm")),
+        *(("conversions", "x-CBF_BYTE_OFFSET"), ("BackgroundCorrectionConstant", 0.002)),
+    ],
+)
+def test_keys_of_edf_that_may_change_values_are_found(name, value, tmp_path):
+    """Not a gain of 1, nor those of the ESRF's cameras."""
+    own = {"image_flip": "<flip x : False,flip y : False>", "image_rotation": "Rotation_0"}
+    own |= {"Offset_1": 0, "PSize_1": 1e-6, "motor_mne": "sx sy", "acq_mode": "Single", "gain": 1}
+    edf(tmp_path / "a.edf", grey(20_000)[0].astype("u2"), **{**own, name: value})
+    assert rtk_images._check_edf(tmp_path / "a.edf")[2] == [f"{name.lower()}={value}"]
+
+
+@needs_rtk
+def test_one_warning_names_the_unknown_keys_of_a_folder(tmp_path):
+    for k in range(3):
+        edf(tmp_path / f"a_{k}.edf", grey(20_000)[k].astype("u2"), gain=2)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        opened(tmp_path, flat=6e4)
+    texts = [str(one.message) for one in found if "gain=2" in str(one.message)]
+    assert len(texts) == 1 and f"{tmp_path}: " in texts[0]
 
 
 @pytest.mark.parametrize(("step", "warned"), [(0.001, False), (0.02, True)])

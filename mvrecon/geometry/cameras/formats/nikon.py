@@ -8,7 +8,14 @@ from typing import NamedTuple
 import torch
 
 from mvrecon.core.files.checks import Refused, check_file, file_errors, text_of
-from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect, section_entries
+from mvrecon.core.files.keys import (
+    EFFECTS,
+    Key,
+    check_keys,
+    has_effect,
+    section_entries,
+    warn_of_unknown,
+)
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.rigs import Detector
@@ -62,7 +69,10 @@ KEYS = (
     Key(
         "OffsetY, OffsetZ, Scaling, OutputUnits, TIFFScaling, ImportConversion, AutoScalingType, "
         "ScalingMinimum, ScalingMaximum, AutomaticCentreOfRotation, "
-        "AutomaticCentreOfRotationOffsetZ1, AutomaticCentreOfRotationOffsetZ2",
+        "AutomaticCentreOfRotationOffsetZ1, AutomaticCentreOfRotationOffsetZ2, "
+        "AutomaticCentreOfRotationMaskRadius, Increment, VirtualDetectorPixelsX, "
+        "VirtualDetectorPixelsY, VirtualDetectorPixelSizeX, VirtualDetectorPixelSizeY, "
+        "VirtualDetectorOffsetX, VirtualDetectorOffsetY, SrcToVirtualDetector",
         "ignored",
         "of its volume",
     ),
@@ -70,6 +80,8 @@ KEYS = (
 )
 #: A line of measured angles: number of the projection and degrees; share by which steps may differ.
 LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*(\d+)[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
+#: Entries of the section CTPro that count as those of XTekCT.
+CTPRO = ("shuttling", "anglefile_use")
 KNOWN = {name.lower() for key in KEYS for name in key.names}
 #: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
 NIKON_EFFECTS = {
@@ -114,7 +126,8 @@ def header(path: str | Path) -> Header:
     check_file(path, "Nikon's .xtekct")
     texts: dict[str, str] = {}
     for section, name, value in section_entries(path):
-        if section == "[xtekct]" and texts.setdefault(name, value) != value:
+        own = section == "[xtekct]" or (section == "[ctpro]" and name in CTPRO)
+        if own and texts.setdefault(name, value) != value:
             raise Refused(f"{path}: expected one {name}, got {texts[name]} and {value}")
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
@@ -126,12 +139,7 @@ def header(path: str | Path) -> Header:
         and value.lower() not in ("", *NO)
         and has_effect(name, value, NIKON_EFFECTS)
     ]
-    if unknown:
-        warnings.warn(
-            f"{path}: ignored the entries {', '.join(unknown[:8])}, which mvrecon does not know "
-            f"although they may change grey values or geometry",
-            stacklevel=3,
-        )
+    warn_of_unknown(path, unknown)
     return Header(path, texts)
 
 

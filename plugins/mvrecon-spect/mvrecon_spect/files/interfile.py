@@ -6,7 +6,6 @@ in STIR (`standardise_interfile_keyword`): case and "!" are ignored, blanks and 
 vendor's own key.
 """
 
-import difflib
 import math
 import os
 import re
@@ -20,7 +19,7 @@ import numpy as np
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_beside, plain_name, shown, text_of
-from mvrecon.core.files.keys import Key, check_keys, has_effect
+from mvrecon.core.files.keys import Key, check_keys, check_unknown
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.formats.common import number
 from mvrecon_spect.files.interfile_keys import (
@@ -28,9 +27,7 @@ from mvrecon_spect.files.interfile_keys import (
     EFFECT,
     EFFECTS,
     KEYS,
-    NOTHING,
     SECTIONS,
-    SLIP,
     SPELLINGS,
     Content,
 )
@@ -127,7 +124,8 @@ def read_header(path: str | Path, content: Content) -> Header:
             unknown key contains a word of `EFFECT` or is a known one with a misspelling.
 
     Warns:
-        UserWarning: the header has no end, although its last line is complete.
+        UserWarning: the header has no end, although its last line is complete; or it has other
+            unknown keys.
     """
     path = Path(path).expanduser()
     if not path.is_file():
@@ -162,10 +160,17 @@ def read_header(path: str | Path, content: Content) -> Header:
             raise Refused(_two_values(path, spelled, values[spelled], value, pairs))
     for name, value in pairs:
         _check_key(path, name, value.strip(), table)
+    unknown = [(str(name), value.strip()) for name, value in pairs if name.base not in table]
     for line in lines:
         name = _name(re.split(r":\s*=|[:=]", line)[0])
-        if ":=" not in line and (_used(name, table) or EFFECT.search(str(name))):
+        if ":=" in line and name.base == STOP:
+            break  # CASToR copies lines of its input behind the end
+        if ":=" in line or not line:
+            continue
+        if _used(name, table) or EFFECT.search(str(name)):
             raise Refused(f"{path}: expected '{name} := value', got {shown(line)}")
+        unknown += [(str(name), line)] * (name.base not in table)
+    check_unknown(path, unknown, (*KEYS, *CONTENT[content]), EFFECTS)
     return Header(path, values)
 
 
@@ -216,15 +221,6 @@ def _check_key(
         )
     if key is not None:
         check_keys(path, [key], lambda _: value)
-    elif not indices and value.lower() not in NOTHING:
-        known = {base.replace(" ", ""): base for base in table if _used(_Name(base), table)}
-        near = difflib.get_close_matches(name.base.replace(" ", ""), known, n=1, cutoff=SLIP)
-        if near or (EFFECT.search(str(name)) and has_effect(str(name), value, EFFECTS)):
-            slip = f"; did you mean {known[near[0]]!r}? Else" if near else ";"
-            raise Refused(
-                f"{path}: expected keys whose effect is known, got {str(name)!r} := {value!r}"
-                f"{slip} apply it, and remove the key"
-            )
 
 
 def _two_values(

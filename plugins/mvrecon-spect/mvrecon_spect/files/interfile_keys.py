@@ -47,7 +47,7 @@ KEYS = (
     Key("number of detector heads", "refused", "join the heads' projections", (1,)),
     Key("data compression", "refused", "plain numbers", ("none",)),
     Key("data encode", "refused", "plain numbers", ("none",)),
-    Key("type of data", "refused", "", ("tomographic", "static", "pet", "other")),
+    Key("type of data", "refused", "", ("tomographic", "static", "dynamic", "pet", "other")),
     Key("camera zoom factor", "refused", "the scaling factors state the pixels", (1,)),
     Key("originating system", "applied", "mvrecon: every offset is a position"),
     Key("imaging modality, version of keys", "ignored", "origin"),
@@ -96,6 +96,38 @@ KEYS = (
         "as in STIR's projectors",
     ),
     Key("flood corrected, uniformity corrected", "ignored", "as cameras do"),
+    Key(
+        "general data, general image data, gate geometry, spect study (general), "
+        "spect study (acquired data), spect study (reconstructed data)",
+        "ignored",
+        "headings",
+    ),
+    Key(
+        "date of keys, conversion program, program author, program version, program date, "
+        "castor version, original institution, contact person, data description, label, comment, "
+        "patient name, patient id, patient dob, patient sex, patient age, patient height, "
+        "patient weight, study id, study date, study time, study description, exam type, "
+        "process label, sms-mi version number, sms-mi header name space, bucket singles rate",
+        "ignored",
+        "origin",
+    ),
+    Key(
+        "isotope name, isotope gamma halflife (sec), radionuclide, radionuclide name, "
+        "radionuclide halflife (sec), radiopharmaceutical, dosage, collimator, collimator name, "
+        "collimator type, collimator thickness, collimator hole diameter, energy resolution, "
+        "reference energy (in keV), head material, crystal material, acquisition mode, "
+        "study duration (elapsed) sec, image start time, image start time (sec), "
+        "pause between images (sec), pause between frame groups (sec)",
+        "ignored",
+        "of the study",
+    ),
+    Key(
+        "image number, frame group number, number of images this frame group, "
+        "number of images in this frame group, maximum pixel count in group, index nesting level, "
+        "total counts, data format",
+        "ignored",
+        "one image in a file, and statistics",
+    ),
     Key(
         ", ".join(
             f"{part} {axis} dimension (cm)" for part in ("head", "crystal") for axis in "xyz"
@@ -190,7 +222,8 @@ CONTENT: dict[Content, tuple[Key, ...]] = {
         Key(
             "decay corrected, attenuation corrected, scatter corrected, applied corrections, "
             "method of attenuation correction, attenuation correction coefficient/cm, "
-            "method of scatter correction, filter name, filter parameters, z-axis filter, "
+            "method of scatter correction, method of reconstruction, filter name, "
+            "filter parameters, z-axis filter, "
             "number of iterations, number of subsets, number of reference frame",
             "ignored",
             "of the reconstruction; values are as stored",
@@ -203,7 +236,7 @@ CONTENT: dict[Content, tuple[Key, ...]] = {
         ),
     ),
 }
-#: Parts of keys that change values or places; a key with one that is not in the tables is refused.
+#: Words of unknown keys that change values or places.
 EFFECT = re.compile(
     r"scal|slope|intercept|factor|multipl|divisor|calibrat|quanti|normali|sensitivit|efficienc|"
     r"offset|exponent|logarithm|correct|decay|attenuat|scatter|dead ?time|subtract|background|"
@@ -217,12 +250,9 @@ EFFECT = re.compile(
     r"tilt\w*|clip\w*|orders?|major|bits?|signed|sizes?|orbits?|arc|radius|radii|axis|axes|gates|"
     r"dimensions)\b"
 )
-#: Values of such a key that change nothing, by its words: 1 of slopes, 0 of offsets.
+#: Values of such a key that change nothing, by its words: 1 of slopes, 0 of offsets; see
+#: `mvrecon.core.files.keys.EFFECTS`.
 EFFECTS = {EFFECT.pattern: None, **keys.EFFECTS, r"\blog|\bpower|correct": None}
-#: Similarity, by `difflib`, from which an unknown key may be a misspelled key of the tables.
-SLIP = 0.9
-#: Values of an unknown key that has no effect.
-NOTHING = {"", "none", "unknown", "{}", "{none}"}
 #: Other spellings of known keys: American, Siemens', and (X)MedCon's of the group "NUD/".
 SPELLINGS = {
     "center": "centre",
