@@ -251,7 +251,14 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
             raise checks.Refused(
                 f"{path}: expected one {name}, got {checks.shown([entries[name], value])}"
             )
-    check_unknown(path, pairs, META_KEYS, META_EFFECTS)
+    rest = "" if entries["ElementDataFile"].lower() == "local" else text[place:]
+    behind = re.findall(r"^\s*([^=:\n]*?)[ \t]*[=:][=: \t]*(.*?)\s*$", rest, re.MULTILINE)
+    used = {name for key in META_KEYS if key.use != "ignored" for name in key.names}
+    if hidden := [name for name, _ in behind if name in used]:
+        raise checks.Refused(
+            f"{path}: expected ElementDataFile last, got {hidden[0]} behind it, which ITK ignores"
+        )
+    check_unknown(path, pairs + behind, META_KEYS, META_EFFECTS)
     return entries, place
 
 

@@ -302,6 +302,27 @@ def test_images_that_itk_converts_are_read_without_a_warning(source, ending, tmp
             read_volume(tmp_path / last)
 
 
+def test_keys_behind_the_file_of_the_values_are_not_ignored_in_silence(tmp_path):
+    """ITK reads no further than ElementDataFile."""
+    for line, key in (
+        ("ElementSpacing = 2 2 2", "ElementSpacing"),
+        ("ElementToIntensityFunctionSlope: 2", "ElementToIntensityFunctionSlope"),
+        ("RescaleSlope = 2", "RescaleSlope"),
+    ):
+        path = meta(tmp_path / "a.mhd", data="a.raw")
+        path.write_text(f"{path.read_text()}{line}\n")
+        with pytest.raises(Refused, match=key):
+            read_volume(path)
+    path = meta(tmp_path / "a.mhd", data="a.raw")
+    own = path.read_text()
+    path.write_text(f"{own}ElementMin = 0\nElementMax = 9")
+    with warnings.catch_warnings(action="error"):
+        assert places(path) == PLACED
+    path.write_text(f"{own}\nFooBar = 0")
+    with pytest.warns(UserWarning, match="FooBar"):
+        assert places(path) == PLACED
+
+
 def turned(degrees, axis, left_handed):
     """Directions of axes turned about one of the world's, of which one may be reversed."""
     x, y, z = np.array(axis) / np.linalg.norm(axis)

@@ -105,6 +105,7 @@ KEYS = (
     Key(
         "date of keys, conversion program, program author, program version, program date, "
         "castor version, original institution, contact person, data description, label, comment, "
+        "comments, date last processed, time last processed, archive status, "
         "patient name, patient id, patient dob, patient sex, patient age, patient height, "
         "patient weight, study id, study date, study time, study description, exam type, "
         "process label, sms-mi version number, sms-mi header name space, bucket singles rate",
@@ -112,7 +113,7 @@ KEYS = (
         "origin",
     ),
     Key(
-        "isotope name, isotope gamma halflife (sec), radionuclide, radionuclide name, "
+        "isotope, isotope name, isotope gamma halflife (sec), radionuclide, radionuclide name, "
         "radionuclide halflife (sec), radiopharmaceutical, dosage, collimator, collimator name, "
         "collimator type, collimator thickness, collimator hole diameter, energy resolution, "
         "reference energy (in keV), head material, crystal material, acquisition mode, "
