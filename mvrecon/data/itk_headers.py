@@ -18,24 +18,20 @@ HEADER = 2**16
 #: Maximum characters of a line of an NRRD header, except comments and key/value pairs: ITK
 #: overflows a buffer at 1000, which ends the process (SimpleITK 2.5.7; 500 are safe).
 LINE = 500
+#: What C takes for blanks.
+BLANKS = " \t\n\r\v\f"
 #: Lengths are mm, which ITK takes all to be: NRRD's and MetaImage's unknown units.
 NO_UNIT = ("", "?")
 #: Keys of other formats that ITK copies into MetaImage, and into NRRD as key/value pairs.
 COPIED = (
-    Key("????|????", "ignored", "of DICOM, by group and element; ITK applied them"),
     Key(
-        "scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, bitpix, "
-        "vox_offset, nifti_type, qform_code*, sform_code*, qfac, qoffset_*, quatern_*, srow_*, "
-        "toffset, cal_min, cal_max, intent_*, slice_*, descrip, aux_file",
+        "????|????, scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, "
+        "bitpix, vox_offset, nifti_type, qform_code*, sform_code*, qfac, qoffset_*, quatern_*, "
+        "srow_*, toffset, cal_min, cal_max, intent_*, slice_*, descrip, aux_file, "
+        "dimension_order, storage_data_type, NRRD_kinds[*], NRRD_centerings[*], NRRD_labels[*], "
+        "NRRD_thicknesses[*], NRRD_space, NRRD_content, NRRD_measurement frame",
         "ignored",
-        "of NIfTI; ITK applied them",
-    ),
-    Key("dimension_order, storage_data_type", "ignored", "of MINC; ITK applied them"),
-    Key(
-        "NRRD_kinds[*], NRRD_centerings[*], NRRD_labels[*], NRRD_thicknesses[*], NRRD_space, "
-        "NRRD_content, NRRD_measurement frame",
-        "ignored",
-        "of NRRD; ITK applied them",
+        "of DICOM (group and element), NIfTI, MINC and NRRD; ITK applied them",
     ),
     Key("ITK_*, CompressionLevel, Software, Modality", "ignored", "of ITK"),
     Key(
@@ -237,7 +233,7 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
     while "ElementDataFile" not in entries:
         line, end, _ = text[place:].partition("\n")
         place += len(line) + len(end)
-        found = re.fullmatch(r"\s*([^=:\r]*?)[ \t]*[=:][=: \t]*([^\r]*?)\s*", line, re.ASCII)
+        found = _pair(line)
         if not end or not (found or not line.strip()):
             raise checks.Refused(
                 f"{path}: expected a MetaImage header of lines such as 'DimSize = 4 3 2' with "
@@ -245,14 +241,14 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
             )
         if found is None:
             continue
-        name, value = found.groups()
+        name, value = found
         pairs.append((name, value))
         if name in known and entries.setdefault(name, value) != value:
             raise checks.Refused(
                 f"{path}: expected one {name}, got {checks.shown([entries[name], value])}"
             )
     rest = "" if entries["ElementDataFile"].lower() == "local" else text[place:]
-    behind = re.findall(r"^\s*([^=:\n]*?)[ \t]*[=:][=: \t]*(.*?)\s*$", rest, re.MULTILINE)
+    behind = [pair for pair in map(_pair, rest.split("\n")) if pair]
     used = {name for key in META_KEYS if key.use != "ignored" for name in key.names}
     if hidden := [name for name, _ in behind if name in used]:
         raise checks.Refused(
@@ -260,6 +256,14 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
         )
     check_unknown(path, pairs + behind, META_KEYS, META_EFFECTS)
     return entries, place
+
+
+def _pair(line: str) -> tuple[str, str] | None:
+    """Key and value of a line of a MetaImage's header as ITK splits it."""
+    sign = re.search("[=:]", line)
+    if sign is None or "\r" in line.strip(BLANKS):
+        return None
+    return line[: sign.start()].strip(BLANKS), line[sign.start() :].lstrip("=: \t").strip(BLANKS)
 
 
 def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:

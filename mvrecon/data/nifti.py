@@ -64,9 +64,10 @@ KEYS = (
         "a warning of texts such as slope=2 or 1/cm, and of extensions of unknown codes",
     ),
 )
-#: Fields of text, the code of an extension that is a comment, a statement in a text, and a unit.
-TEXTS, COMMENT_CODE = ("descrip", "intent_name", "aux_file"), 6
-STATEMENT = re.compile(r"([^\W\d][\w ]*?)(?: *[=:] *| +(?=[-+]?\.?\d))([^;,\s]+)")
+#: Fields of text, the code of an extension that is a comment, and its characters that are read.
+TEXTS, COMMENT_CODE, COMMENT = ("descrip", "intent_name", "aux_file"), 6, 2**12
+#: Between the name and the value of a statement in a text, and a unit in it.
+BETWEEN = re.compile(r"[=:]|\s(?=[-+]?\.?\d)")
 INVERSE_CM = re.compile(r"/ ?cm\b|\bcm ?\^? ?-1\b", re.IGNORECASE)
 #: Largest distance of a voxel's place by sform and by qform, in voxels.
 MAX_FORM_DISTANCE = 0.1
@@ -267,7 +268,7 @@ def _texts(path: Path, header: Any) -> Iterator[str]:
     while extended and place + 8 < len(raw):
         size, code = struct.unpack_from(f"{header.endianness}2i", raw, place)
         if code == COMMENT_CODE:
-            texts.append(("comment", raw[place + 8 : place + size]))
+            texts.append(("comment", raw[place + 8 : place + size][:COMMENT]))
         elif code not in codes:
             yield f"extension of code {code}"
         if size < 8:
@@ -275,7 +276,9 @@ def _texts(path: Path, header: Any) -> Iterator[str]:
         place += size
     for name, value in texts:
         text = value.decode("latin-1").strip("\0 ")
-        if INVERSE_CM.search(text) or any(has_effect(*one) for one in STATEMENT.findall(text)):
+        parts = [BETWEEN.split(part, maxsplit=1) for part in re.split("[;,\n]", text)]
+        stated = any(has_effect(part[0], part[1]) for part in parts if len(part) == 2)
+        if stated or INVERSE_CM.search(text):
             yield f"{name} {checks.shown(text)}"
 
 

@@ -302,6 +302,24 @@ def test_images_that_itk_converts_are_read_without_a_warning(source, ending, tmp
             read_volume(tmp_path / last)
 
 
+@pytest.mark.parametrize("line", [" " * 60_000, "dim" * 20_000, f"{'dim' * 20_000} = 2"])
+@pytest.mark.parametrize("place", ["ObjectType", "ElementDataFile", ""])
+def test_long_lines_are_read_without_a_wait(place, line, tmp_path):
+    """Blanks, and a name with the beginning of a word of effect, anywhere in a header; messages
+    show the beginning.
+    """
+    path = meta(tmp_path / "a.mhd", data="a.raw")
+    text = path.read_text()
+    path.write_text(text.replace(place, f"{line}\n{place}", 1) if place else text + line)
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        try:
+            assert places(path) == PLACED
+        except Refused as error:
+            assert len(str(error)) < 2000
+    assert all(len(str(one.message)) < 2000 for one in found)
+
+
 def test_keys_behind_the_file_of_the_values_are_not_ignored_in_silence(tmp_path):
     """ITK reads no further than ElementDataFile."""
     for line, key in (

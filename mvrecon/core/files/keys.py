@@ -48,8 +48,8 @@ EFFECTS = {
 }
 
 
-#: Unknown keys that a warning names.
-NAMED = 8
+#: Unknown keys that a warning names, and characters of a name that are searched for words.
+NAMED, SEARCHED = 8, 256
 #: Values of an unknown key that state nothing.
 NOTHING = ("", "none", "unknown", "{}", "{none}")
 #: Similarity of letters, by `difflib`, from which an unknown key may be a misspelled known one.
@@ -65,7 +65,8 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
 
 
 def _neutral(name: str, effects: Mapping[str, Any]) -> list[Any]:
-    return [none for words, none in effects.items() if re.search(words, name, re.IGNORECASE)]
+    start = name[:SEARCHED]
+    return [none for words, none in effects.items() if re.search(words, start, re.IGNORECASE)]
 
 
 def check_unknown(
@@ -102,8 +103,8 @@ def check_unknown(
         if near or has_effect(name, value, effects):
             slip = f"; did you mean {used[near[0]]}? Else" if near else ";"
             raise Refused(
-                f"{path}: expected keys whose effect is known, got {name} {shown(value)}{slip} "
-                f"apply it, and remove the key"
+                f"{path}: expected keys whose effect is known, got {_brief(name)} {shown(value)}"
+                f"{slip} apply it, and remove the key"
             )
     warn_of_unknown(path, [name for name, _ in unknown if not _neutral(name, effects)])
 
@@ -118,8 +119,9 @@ def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:
     if unknown := list(dict.fromkeys(names)):
         more = f" and {len(unknown) - NAMED} others" if len(unknown) > NAMED else ""
         warnings.warn(
-            f"{path}: ignores keys that mvrecon does not know: {', '.join(unknown[:NAMED])}{more}; "
-            f"if one changes values or geometry, apply it to the file first",
+            f"{path}: ignores keys that mvrecon does not know: "
+            f"{', '.join(map(_brief, unknown[:NAMED]))}{more}; if one changes values or geometry, "
+            f"apply it to the file first",
             stacklevel=2,  # one place for every caller, so that Python shows it once
         )
 
@@ -165,9 +167,13 @@ def _missing(value: Any) -> bool:
     return value is None or (hasattr(value, "__len__") and len(value) == 0)
 
 
+def _brief(name: str) -> str:
+    return name if len(name) < SEARCHED and name.isprintable() else shown(name)
+
+
 def _letters(name: str) -> str:
     """The letters of a name, without those of its section (`file1.size`)."""
-    return re.sub(r"[\W\d_]", "", name.lower().rpartition(".")[2])
+    return re.sub(r"[\W\d_]", "", name[:SEARCHED].lower().rpartition(".")[2])
 
 
 def _plain(value: Any) -> Any:

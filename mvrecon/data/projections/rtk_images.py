@@ -5,7 +5,6 @@ Values are RTK's before its logarithm: grey values that rise with intensity. RTK
 .his, 65536 - v, and leaves out its four outer rows and columns.
 """
 
-import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -152,11 +151,12 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
     ends = [n for n in range(EDF_BLOCK, len(text) + 1, EDF_BLOCK) if text[n - 2 : n] == b"}\n"]
     if not ends:
         raise Refused(f"{file}: expected a header of EDF in blocks of {EDF_BLOCK} bytes, got none")
-    entries = {
-        name.lower(): value.strip()
-        for name, value in re.findall(r"([\w ]+?)\s*=([^;]*);", text[: ends[0]].decode("latin-1"))
+    pairs = (part.partition("=") for part in text[: ends[0]].decode("latin-1").split(";")[:-1])
+    stated = {
+        name.rpartition("\n")[2].strip("{ \t\r").lower(): value.strip()
+        for name, sign, value in pairs
+        if sign
     }
-    stated = {name.strip(): value for name, value in entries.items()}
     check_keys(file, EDF_KEYS, lambda name: stated.get(name.lower()))
     kind = EDF_TYPES[stated.get("datatype", "missing").lower()]
     needed = int(stated["dim_1"]) * int(stated["dim_2"]) * np.dtype(kind).itemsize

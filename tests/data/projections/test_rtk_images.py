@@ -274,6 +274,13 @@ def test_keys_of_edf_that_may_change_values_are_found(name, value, tmp_path):
     assert rtk_images._check_edf(tmp_path / "a.edf")[2] == [f"{name.lower()}={value}"]
 
 
+def test_a_long_header_of_edf_is_read_without_a_wait(tmp_path):
+    """Of a key without a value, and of a name with a hyphen."""
+    values = grey(20_000)[0].astype("u2")
+    edf(tmp_path / "a.edf", values, **{"my-gain": "2 ;\n" + "a" * 60_000})
+    assert rtk_images._check_edf(tmp_path / "a.edf")[2] == ["my-gain=2"]
+
+
 @needs_rtk
 def test_one_warning_names_the_unknown_keys_of_a_folder(tmp_path):
     for k in range(3):
