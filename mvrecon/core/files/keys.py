@@ -6,6 +6,7 @@ import math
 import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -16,7 +17,8 @@ class Key(NamedTuple):
     """A key of a format's header.
 
     Args:
-        name: the key as the format spells it, or several, separated by ", ".
+        name: the key as the format spells it, or several, separated by ", "; of those that are
+            ignored, `*` stands for any characters.
         use: "applied" to values or geometry; "compared" with what it repeats, and refused where it
             contradicts that; "refused" unless its value is one of `allowed`; or "ignored", for the
             reason in `note`.
@@ -56,6 +58,16 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
     """
     neutral = [none for words, none in effects.items() if re.search(words, name, re.IGNORECASE)]
     return bool(neutral) and _plain(value) != _plain(neutral[-1])
+
+
+def unknown_names(names: Iterable[str], keys: Sequence[Key]) -> list[str]:
+    """Those of some names that no key of a format has, each once."""
+    known = [name for key in keys for name in key.names]
+    return [
+        name
+        for name in dict.fromkeys(names)
+        if not any(fnmatchcase(name, pattern) for pattern in known)
+    ]
 
 
 def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:

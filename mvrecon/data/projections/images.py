@@ -171,6 +171,7 @@ class ImageFiles(ProjectionStack):
             exposures.warn_of_several(files[0].parent, name, texts, cure)
         self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm = headers[0].pixel_mm
+        self.unknown = [name for head in headers for name in head.unknown]
         self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,
