@@ -227,18 +227,16 @@ def check_fields(path: Path, group: h5py.Group, own: str) -> None:
 
 
 def fields_with_effect(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets in a group that have a word of `effects`, and a value that may change
-    something.
+    """Names of the data sets in a group, and of links, that have a word of `effects`, and a value
+    that may change something; links are not followed.
     """
     found = []
     for name in group:
-        if has_effect(name, "", effects) and isinstance(
-            group.get(name, getlink=True), h5py.HardLink
-        ):
-            field = group[name]
-            if isinstance(field, h5py.Dataset) and has_effect(
-                name, _value(group, name, field), effects
-            ):
+        if has_effect(name, "", effects):
+            link = group.get(name, getlink=True)
+            field = group[name] if isinstance(link, h5py.HardLink) else link
+            group_of_its_own = isinstance(field, h5py.Group)
+            if not group_of_its_own and has_effect(name, _value(group, name, field), effects):
                 found.append(name)
     return found
 

@@ -43,7 +43,8 @@ EFFECTS = {
     "scal(e|ing)(?!_?(types?|bar))|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
     "offset|intercept|bias|skip": 0,
     "fill|missing|valid|nodata": math.nan,
-    "unit|calibrat|quanti|unsigned|endian|mirror|flip|transpos|logarithm|"
+    "mirror|flip|transpos": 0,
+    "unit|calibrat|quanti|unsigned|endian|logarithm|"
     "(?<![a-z])order(?![a-z])|(byte|ax[ei]s|dim[a-z]*|index|storage).?order": None,
 }
 

@@ -89,8 +89,11 @@ OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
-#: Entries of any text: `name = value` or `name: value`, and elements of XML.
-ENTRY = re.compile(r"([A-Za-z_][\w .()/-]{0,60}?)[\"']?\s*[:=]\s*[\"']?([^\s\"']+)")
+#: Entries of any text: a name, `=`, `:` or a tabulator, and a word or a list; and elements of XML.
+ENTRY = re.compile(
+    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)[\"']?[ ]*[:=\t][ \t]*[\"']?"
+    r"(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+)"
+)
 ELEMENT = re.compile(r"<([\w:.-]{1,60})(?:\s[^<>]{0,200})?>\s*([^<>\s][^<>]{0,200})</")
 NAMED = re.compile(
     r"\b(?:name|key)\s*=\s*[\"']([^\"'<>]{1,60})[\"'][^<>]{0,200}?(?:value\s*=\s*[\"']|>\s*)"
@@ -122,18 +125,20 @@ def effects(text: str) -> list[str]:
     if not has_effect(text, text) or OME.search(text) or text.startswith("<MetaData"):
         return []
     known = {name for program, name in KNOWN if program == "Dectris" or program in text}
-    parts = re.split(r"[\n\r;,{}<>\[\]]+", LINE.sub("", text))
-    found = [pair for part in parts for pair in ENTRY.findall(part)]
+    lines = [line for line in LINE.sub("", text).splitlines() if has_effect(line, line)]
+    found = [pair for line in lines for pair in ENTRY.findall(line)]
     for pattern in (LINE, ELEMENT, NAMED):
         found += pattern.findall(text)
     return sorted(
         {
             name.strip()
             for name, value in found
-            if has_effect(name, value.strip())
-            and value.strip().lower() not in {"", *OTHER_UNITS}
-            and name.strip() not in known
+            if name.strip() not in known
             and not OF_DISPLAY.search(name)
+            and any(
+                has_effect(name, part) and part.lower() not in OTHER_UNITS
+                for part in re.findall(r"[^\s,;()\[\]]+", value)
+            )
         }
     )
 
