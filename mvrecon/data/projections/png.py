@@ -13,11 +13,12 @@ from mvrecon.core.files.checks import EDGE, Refused
 from mvrecon.core.files.keys import Key, check_keys, has_effect, unknown_names
 from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import Header
+from mvrecon.data.projections.tiff import EXIF_BEAM
 
 #: Pixel types of a grey PNG by Pillow's mode.
 MODES = {"1": "?", "L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
-#: Tag of EXIF for the order of rows and columns.
-ORIENTATION = 274
+#: Tag of the camera's part of EXIF.
+CAMERA = 0x8769
 #: Chunks of texts.
 TEXTS = ("tEXt", "zTXt", "iTXt")
 #: Chunks and fields of PNG that change the pixels, and those that ordinary files have; a warning
@@ -31,6 +32,12 @@ PNG_KEYS = (
     Key("pCAL", "refused", "store the values that the calibration gives"),
     Key("sTER", "refused", "one image, not a pair beside each other"),
     Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
+    Key("eXIf: Gamma", "refused", "linear values", (1,)),
+    Key(
+        ", ".join(f"eXIf: {name}" for name in ("ExposureTime", *EXIF_BEAM)),
+        "compared",
+        "of all views and of flat fields, as those of TIFF",
+    ),
     Key(
         "text: ...",
         "compared",
@@ -66,7 +73,8 @@ def png_header(file: Path) -> Header:
             bits, colours = struct.unpack_from("BB", raw.read(26), 24)
         chunks = dict.fromkeys((name for name, _ in _chunks(file)), "one")
         stated = {"bit depth": bits, "colour type": colours, **chunks}
-        stated["eXIf: Orientation"] = image.getexif().get(ORIENTATION) if "eXIf" in chunks else None
+        exif = _exif(image) if "eXIf" in chunks else {}
+        stated |= {f"eXIf: {name}": value for name, value in exif.items()}
         check_keys(file, PNG_KEYS, stated.get)
         texts = image.text.items() if {*TEXTS} & {*chunks} else ()
         entries = [
@@ -81,7 +89,27 @@ def png_header(file: Path) -> Header:
                 f"{columns} of the type {image.mode}"
             )
         head = Header((rows, columns), np.dtype(kind), 1, frozenset([2.0**bits - 1]))
+        stated = {
+            name: f"{exif[name]:g}" if isinstance(exif[name], float) else str(exif[name])
+            for name in EXIF_BEAM
+            if name in exif
+        }
+        if (time := exif.get("ExposureTime")) is not None:
+            stated["ExposureTime"] = descriptions.milliseconds(file, float(time), "s")
+        head = head._replace(stated={name: [text] for name, text in stated.items()})
         return head._replace(unknown=unknown_names([*chunks, *entries], PNG_KEYS))
+
+
+def _exif(image: Any) -> dict[str, Any]:
+    """The entries of EXIF by their names; ratios as numbers."""
+    from PIL import ExifTags
+    from PIL.TiffImagePlugin import IFDRational
+
+    exif = image.getexif()
+    return {
+        ExifTags.TAGS.get(tag, str(tag)): float(value) if isinstance(value, IFDRational) else value
+        for tag, value in {**exif, **exif.get_ifd(CAMERA)}.items()
+    }
 
 
 def png_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:

@@ -165,6 +165,32 @@ def test_chunks_and_texts_of_png_that_no_reader_knows_are_named(case, packed, tm
     assert named(tmp_path, **GIVEN) == expected
 
 
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({33434: 0.02}, "values of ExposureTime, 10 or 20"),
+        ({34855: 200}, "values of ISOSpeedRatings"),
+        ({42240: 2.2}, "eXIf: Gamma 1, got 2.2"),
+        ({42240: 1.0}, None),
+    ],
+)
+def test_exif_of_png_is_compared_as_that_of_tiff(entries, message, tmp_path):
+    for k in range(3):
+        exif = Pillow.Exif()
+        camera = {33434: 0.01, 34855: 100, 33437: 8.0, **(entries if k == 1 else {})}
+        exif.get_ifd(0x8769).update(camera)
+        exif[0x8769] = dict(exif.get_ifd(0x8769))
+        Pillow.fromarray(grey()[k]).save(tmp_path / f"{k}.png", exif=exif)
+    if message is None:
+        assert named(tmp_path, **GIVEN) == []
+    elif message.startswith("eXIf"):
+        with pytest.raises(Refused, match=message):
+            opened(tmp_path, **GIVEN)
+    else:
+        with pytest.warns(UserWarning, match=message):
+            opened(tmp_path, **GIVEN)
+
+
 FRAMES = "entry/instrument/detector/data"
 ATTRIBUTES = {
     "ordinary": (
