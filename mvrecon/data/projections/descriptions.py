@@ -92,7 +92,7 @@ NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
 #: Entries of any text: a name, `=`, `:` or a tabulator, and a word or a list; and elements of XML.
 ENTRY = re.compile(
     r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)[\"']?[ ]*[:=\t][ \t]*[\"']?"
-    r"(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+)"
+    r"(?=(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+))"
 )
 ELEMENT = re.compile(r"<([\w:.-]{1,60})(?:\s[^<>]{0,200})?>\s*([^<>\s][^<>]{0,200})</")
 NAMED = re.compile(

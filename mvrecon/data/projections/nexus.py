@@ -129,7 +129,7 @@ KEYS = (
 #: Words of fields beside the frames that a warning names, and their values that change nothing.
 FIELD_EFFECTS = {
     **EFFECTS,
-    "flip|mirror|transpos|rotat|invert|swap|polar_angle": 0,
+    "flip|mirror|transpos|invert|swap|polar_angle": 0,
     "time_of_flight": None,
 }
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.

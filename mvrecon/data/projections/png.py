@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused
-from mvrecon.core.files.keys import Key, check_keys, has_effect, unknown_names
+from mvrecon.core.files.keys import Key, check_keys, unknown_names
 from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import Header
 from mvrecon.data.projections.tiff import EXIF_BEAM
@@ -80,7 +80,7 @@ def png_header(file: Path) -> Header:
         entries = [
             f"text: {entry}"
             for name, text in texts
-            for entry in ([name] if has_effect(name, text) else descriptions.effects(text))
+            for entry in descriptions.effects(f"{name}: {text}")
         ]
         kind = MODES.get(image.mode)
         if kind is None or max(rows, columns) > EDGE:

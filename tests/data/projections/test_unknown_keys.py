@@ -107,6 +107,7 @@ TEXTS = {
     "Rescale Slope: 2\nRescale Intercept: -1000": ["Rescale Intercept", "Rescale Slope"],
     "gain=1 offset=5": ["offset"],
     "Exposure=2;Bias=100;": ["Bias"],
+    "Detector:slope=2\nPixel: offset=100\nLens: gain=1": ["offset", "slope"],
     '{"camera": {"scale": [0.01, 1]}, "offset": [0, 0], "gain": {"value": 2}}': ["gain", "scale"],
     "Slope\t2\nIntercept\t0": ["Slope"],
     "<a><slope>0.5</slope><b offset='3'/></a>": ["b offset", "slope"],
