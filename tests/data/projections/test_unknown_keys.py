@@ -198,7 +198,13 @@ ATTRIBUTES = {
         {
             **{"NX_class": "a", "long_name": "b", "target": "/c", "signal": 1, "CLASS": "IMAGE"},
             **{"interpretation": "image", "IMAGE_SUBCLASS": "IMAGE_GRAYSCALE", "PALETTE": 1},
-            **{"DISPLAY_ORIGIN": "UL", "MATLAB_class": "uint16", "coordinates": "a b"},
+            **{
+                "flip": False,
+                "mirrored": 0,
+                "DISPLAY_ORIGIN": "UL",
+                "MATLAB_class": "uint16",
+                "coordinates": "a b",
+            },
         },
         [],
     ),
