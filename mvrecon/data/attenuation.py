@@ -8,17 +8,22 @@ nanodrr. For emission the lines lead to attenuation at the isotope's energy: at 
 0.01536 / mm for water and 0.0295 / mm for cortical bone (NIST XCOM).
 """
 
+import re
 from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.files.checks import Refused, shown
+
 #: Units of the numbers in a file: Hounsfield units, linear attenuation, or any unit of activity.
 StoredUnit = Literal["HU", "1/mm", "activity"]
 #: Unit of a concentration of activity, 1 Bq / mm^3; "activity" is in any unit.
 CONCENTRATION = "kBq/ml"
 UNITS: tuple[StoredUnit, ...] = ("HU", "1/mm", "activity")
+#: Units of line integrals, as of mvrecon's scenes or without, and of another projector's output.
+UNIT_OF_VIEWS = re.compile(r"1|1/mm|\S.* \* mm|\S+ of \S.*")
 
 #: Water, in 1/mm.
 WATER = 0.0192
@@ -41,6 +46,24 @@ class Tissue(NamedTuple):
 CT_KEV, SPECT_KEV = 70.0, 140.5
 #: By the energy in keV.
 TISSUES = {CT_KEV: Tissue(WATER, BONE), SPECT_KEV: Tissue(0.01536, 0.0295)}
+
+
+def check_unit_of_views(unit: str, where: str = "") -> None:
+    """Check that the unit of views is one of line integrals, or of a projector's output.
+
+    Args:
+        unit: unit of the views, of counts divided by their dose.
+        where: the views, for the message.
+
+    Raises:
+        Refused: another unit, in which mvrecon does not know what the values are.
+    """
+    if not UNIT_OF_VIEWS.fullmatch(unit):
+        raise Refused(
+            f"{where}expected a unit of views such as '1/mm * mm' (line integrals) or 'spect of "
+            f"activity', got {shown(unit)}; of another program's values, remove the attribute "
+            f"unit, and say views.dataset=/views and views.kind"
+        )
 
 
 def physical(

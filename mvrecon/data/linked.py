@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file
+from mvrecon.core.files.keys import Key, check_keys, has_effect, unknown_names
 from mvrecon.data.storage import (
     check_attributes,
     check_chunks,
@@ -25,6 +26,34 @@ MAX_LINKS, MAX_GROUPS = 16, 2**14
 MAX_TEXTS = 16
 #: Most values of a data set that is read whole, such as the angles.
 MAX_VALUES = 2**20
+
+
+#: Attributes of data sets besides those with a word of `EFFECTS`, which are refused; a warning
+#: names all others.
+ATTRIBUTES = (
+    Key("DISPLAY_ORIGIN", "refused", "the first row is the upper one, as views.flip_rows", ("UL",)),
+    Key("IMAGE_SUBCLASS", "refused", "grey values", ("IMAGE_GRAYSCALE",)),
+    Key(
+        "axes, *_indices, DIMENSION_LABELS, NDArrayDim*, transformation_type, vector, depends_on",
+        "compared",
+        "attributes of the frames and of the angles",
+    ),
+    Key(
+        "NX_class, long_name, target, signal, primary, axis, interpretation, description, name, "
+        "local_name, title, label, comment, source, date, timestamp, creator, version, history, "
+        "check_sum, default, SILX_style*, NDArrayNumDims, NDArrayColorMode, NDAttr*, image_nr_*, "
+        "decimals, file_name, equipment_component",
+        "ignored",
+        "texts, links and plots of NeXus and areaDetector",
+    ),
+    Key(
+        "CLASS, NAME, VERSION, TITLE, FLAVOR, EXTDIM, REFERENCE_LIST, DIMENSION_LIST, IMAGE_*, "
+        "INTERLACE_MODE, PALETTE, MATLAB_*, H5PATH, _Netcdf4*, _NC*, coordinates, standard_name, "
+        "institution, references, Conventions, cell_methods, grid_mapping, actual_range",
+        "ignored",
+        "of HDF5, MATLAB and netCDF, and of the display",
+    ),
+)
 
 
 class MissingFile(Refused):
@@ -129,6 +158,20 @@ def check_around(place: Place) -> None:
                 check_fields(path, group, part)
                 if isinstance(group.get(part, getlink=True), h5py.HardLink):
                     group = group[part]  # type: ignore[assignment]
+
+
+def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
+    """The attributes of a data set that neither its reader nor `ATTRIBUTES` know, as
+    <data set>@<name>.
+
+    Raises:
+        Refused: one of `ATTRIBUTES` to refuse.
+    """
+    check_keys(place.path, ATTRIBUTES, lambda name: texts_at([place], name).get(place))
+    with opened(place.path) as file:
+        names = [name for name in file[place.name].attrs if not has_effect(name, "")]
+    own = place.name.rpartition("/")[2]
+    return [f"{own}@{name}" for name in unknown_names(names, ATTRIBUTES) if name not in known]
 
 
 def values_at(place: Place, known: tuple[str, ...] = ()) -> np.ndarray:

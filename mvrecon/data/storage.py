@@ -5,7 +5,7 @@ more bytes than declared; and atomic writing of HDF5 files that fit in memory.
 import math
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from itertools import product
@@ -226,20 +226,41 @@ def check_fields(path: Path, group: h5py.Group, own: str) -> None:
                 _check_effect(path, group, name, field, f"field {name!r} beside {beside!r}")
 
 
+def fields_with_effect(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
+    """Names of the data sets in a group, and of links, that have a word of `effects`, and a value
+    that may change something; links are not followed.
+    """
+    found = []
+    for name in group:
+        if has_effect(name, "", effects):
+            link = group.get(name, getlink=True)
+            field = group[name] if isinstance(link, h5py.HardLink) else link
+            group_of_its_own = isinstance(field, h5py.Group)
+            if not group_of_its_own and has_effect(name, _value(group, name, field), effects):
+                found.append(name)
+    return found
+
+
 def _check_effect(path: Path, holder: Any, name: str, kind: Any, what: str) -> None:
     """Raise for an attribute of a holder, or a field in it, that would change values."""
-    value = type(kind).__name__  # of a link, which is not followed
-    if hasattr(kind, "dtype"):
-        few = kind.shape is not None and 0 < math.prod(kind.shape) <= MAX_NUMBERS
-        own = holder.attrs if isinstance(kind, h5py.h5a.AttrID) else holder
-        numbers = np.ravel(own[name]).tolist() if few and kind.dtype.kind in "iuf" else []
-        one = len({*map(str, numbers)}) == 1  # one of each axis, as [0 0]
-        value = numbers[0] if one else numbers or str(kind.dtype)
-    if has_effect(name, value):
+    if has_effect(name, value := _value(holder, name, kind)):
         raise Refused(
             f"{path}: expected no {what}, which the reader does not apply, got {value}; apply it, "
             f"and remove it"
         )
+
+
+def _value(holder: Any, name: str, kind: Any) -> Any:
+    """A number of an attribute of a holder, or of a field in it; its type if it has others."""
+    value = type(kind).__name__  # of a link, which is not followed
+    if hasattr(kind, "dtype"):
+        few = kind.shape is not None and 0 < math.prod(kind.shape) <= MAX_NUMBERS
+        own = holder.attrs if isinstance(kind, h5py.h5a.AttrID) else holder
+        numbers = np.ravel(own[name]) * 1 if few and kind.dtype.kind in "biuf" else np.zeros(0)
+        numbers = numbers.tolist()
+        one = len({*map(str, numbers)}) == 1  # one of each axis, as [0 0]
+        value = numbers[0] if one else numbers or str(kind.dtype)
+    return value
 
 
 def check_chunks(path: Path, dataset: h5py.Dataset, index: int | None = None) -> None:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import PART_ENDING, write_text
-from mvrecon.data.attenuation import hounsfield
+from mvrecon.data.attenuation import check_unit_of_views, hounsfield
 from mvrecon.data.dataset import Batch
 from mvrecon.data.nifti import save_nifti
 from mvrecon.data.projections.stack import MU_FILE
@@ -74,7 +74,8 @@ def save_views(
         folder: folder of all cases.
         name: name of the case and its subfolder, which is returned.
         views: line integrals, or another projector's output.
-        unit: unit of the views.
+        unit: unit of the views: "1/mm * mm" and the like of line integrals, or "<projector> of
+            <unit>".
         attenuated: whether they are counts that the map of `save_truth`, else `projector.mu`,
             attenuated.
         dose: expected counts per unit of the views; None: they are no counts.
@@ -82,8 +83,9 @@ def save_views(
 
     Raises:
         ValueError: a dose or a duration that is not positive and finite, or views that are not
-            finite in float32.
+            finite in float32, or in a unit that is neither.
     """
+    check_unit_of_views(unit)
     case, about = folder / file_name(name), {"unit": unit}
     values = views.detach().cpu().double()
     for key, number in {"dose": dose, "duration": duration_s}.items():

@@ -43,7 +43,8 @@ EFFECTS = {
     "scal(e|ing)(?!_?(types?|bar))|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
     "offset|intercept|bias|skip": 0,
     "fill|missing|valid|nodata": math.nan,
-    "unit|calibrat|quanti|unsigned|endian|mirror|flip|transpos|logarithm|"
+    "mirror|flip|transpos": 0,
+    "unit|calibrat|quanti|unsigned|endian|logarithm|"
     "(?<![a-z])order(?![a-z])|(byte|ax[ei]s|dim[a-z]*|index|storage).?order": None,
 }
 
@@ -89,15 +90,10 @@ def check_unknown(
         Refused: an unknown key with one of these words and a value that has an effect, or with the
             name of a known key but for a typing error; the message names it.
     """
-    names = [(name, key) for key in keys for name in key.names]
-    patterns = (re.escape(name).replace(r"\*", ".*").replace(r"\?", ".") for name, _ in names)
-    known = re.compile("|".join(patterns))
-    used = {_letters(name): name for name, key in names if key.use != "ignored"}
-    unknown = [
-        (name, value)
-        for name, value in stated
-        if not known.fullmatch(name) and value.strip().lower() not in NOTHING
-    ]
+    used = {_letters(name): name for key in keys if key.use != "ignored" for name in key.names}
+    pairs = [(name, value) for name, value in stated if value.strip().lower() not in NOTHING]
+    names = {*unknown_names((name for name, _ in pairs), keys)}
+    unknown = [(name, value) for name, value in pairs if name in names]
     for name, value in unknown:
         near = difflib.get_close_matches(_letters(name), used, n=1, cutoff=SLIP)
         if near or has_effect(name, value, effects):
@@ -107,6 +103,13 @@ def check_unknown(
                 f"{slip} apply it, and remove the key"
             )
     warn_of_unknown(path, [name for name, _ in unknown if not _neutral(name, effects)])
+
+
+def unknown_names(names: Iterable[str], keys: Sequence[Key]) -> list[str]:
+    """Those of some names that no key of a format has, each once."""
+    patterns = (re.escape(name) for key in keys for name in key.names)
+    known = re.compile("|".join(patterns).replace(r"\*", ".*").replace(r"\?", "."))
+    return [name for name in dict.fromkeys(names) if not known.fullmatch(name)]
 
 
 def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:

@@ -1,5 +1,6 @@
-"""What programs describe in a TIFF beside its tags: OME (Goldberg and others, Genome Biology 6,
-2005), Micro-Manager, and the detectors of Dectris, whose negative pixels are bad ones.
+"""What programs describe in an image beside its tags: OME (Goldberg and others, Genome Biology 6,
+2005), Micro-Manager, and the detectors of Dectris, whose negative pixels are bad ones; and the
+entries of other texts that may change values.
 """
 
 import math
@@ -14,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from mvrecon.core.files.checks import Refused, millimetres, shown
-from mvrecon.core.files.keys import Key
+from mvrecon.core.files.checks import MILLIMETRES, Refused, millimetres, shown
+from mvrecon.core.files.keys import Key, has_effect
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -62,11 +63,18 @@ KEYS = (
     Key("Dectris: Pixel_size", "compared", "with the cameras' pixel size"),
     Key(
         "Dectris: Start_angle, Dectris: Angle_increment, Dectris: Detector_distance, "
-        "Dectris: Beam_xy",
+        "Dectris: Beam_xy, Dectris: Detector_Voffset",
         "ignored",
         "the camera decides",
     ),
+    Key(
+        "ImageJ: unit, ImageJ: yunit, ImageJ: zunit, SCIFIO: units, SCIFIO: scales, ImageJ: vunit",
+        "ignored",
+        "of the pixel size, and the name of values that cf calibrates",
+    ),
 )
+#: Entries that are known, by the name of a program.
+KNOWN = [name.split(": ", 1) for key in KEYS for name in key.names]
 #: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
 OME, ATTRIBUTE = re.compile(r"<(\w+:)?OME\b"), re.compile(r"([\w-]+)\s*=\s*[\"']([^\"']*)[\"']")
 #: Parts of OME's description that may quote its elements: comments, and what other programs wrote.
@@ -81,6 +89,23 @@ OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
+#: Entries of any text: a name, `=`, `:` or a tabulator, and a word or a list; and elements of XML.
+ENTRY = re.compile(
+    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)[\"']?[ ]*[:=\t][ \t]*[\"']?"
+    r"(?=(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+))"
+)
+ELEMENT = re.compile(r"<([\w:.-]{1,60})(?:\s[^<>]{0,200})?>\s*([^<>\s][^<>]{0,200})</")
+NAMED = re.compile(
+    r"\b(?:name|key)\s*=\s*[\"']([^\"'<>]{1,60})[\"'][^<>]{0,200}?(?:value\s*=\s*[\"']|>\s*)"
+    r"([^\"'<>]{1,200})"
+)
+#: Names of scales of the display, of stages and lenses; and units of other things than values.
+OF_DISPLAY = re.compile("spatial|stage|zoom|magnif|auto.?scale|display|look.?up", re.IGNORECASE)
+OTHER_UNITS = {
+    *MILLIMETRES,
+    *("pixel", "pixels", "px", "inch", "in", "s", "sec", "ms", "us", "deg", "degrees", "rad"),
+    *("v", "kv", "kev", "ev", "ma", "ua", "a", "w", "c", "k", "bit", "bits"),
+}
 #: A comma between thousands.
 THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
@@ -90,6 +115,32 @@ def without_own_id(text: str) -> str:
     text, which is parsed once.
     """
     return OWN_ID.sub("", text, count=1)
+
+
+@lru_cache(maxsize=32)
+def effects(text: str) -> list[str]:
+    """Names of the entries of a text that may change values: lines of a name and a value, JSON,
+    XML; none of OME's and MetaMorph's texts, whose entries are of the display and the microscope.
+    """
+    if not has_effect(text, text) or OME.search(text) or text.startswith("<MetaData"):
+        return []
+    known = {name for program, name in KNOWN if program == "Dectris" or program in text}
+    lines = [line for line in LINE.sub("", text).splitlines() if has_effect(line, line)]
+    found = [pair for line in lines for pair in ENTRY.findall(line)]
+    for pattern in (LINE, ELEMENT, NAMED):
+        found += pattern.findall(text)
+    return sorted(
+        {
+            name.strip()
+            for name, value in found
+            if name.strip() not in known
+            and not OF_DISPLAY.search(name)
+            and any(
+                has_effect(name, part) and part.lower() not in OTHER_UNITS
+                for part in re.findall(r"[^\s,;()\[\]]+", value)
+            )
+        }
+    )
 
 
 @lru_cache(maxsize=4)

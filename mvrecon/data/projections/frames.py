@@ -1,7 +1,7 @@
 """Frames of an HDF5 file as views: those of one data set, or of the parts of a virtual one."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,7 +13,14 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_image import same
-from mvrecon.data.linked import Place, beside, check_around, followed, numbers_at
+from mvrecon.data.linked import (
+    Place,
+    beside,
+    check_around,
+    followed,
+    numbers_at,
+    unknown_attributes,
+)
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 
@@ -66,6 +73,8 @@ class Frames:
             )
         self._ends = ends.tolist()
         self.region = {name: self._common(name) for name in REGION}
+        places = dict.fromkeys([place, *(part.place for part in self.parts)])
+        self.unknown = [name for one in places for name in unknown_attributes(one)]
 
     def _common(self, name: str) -> np.ndarray | None:
         """An attribute of the data set, and of those of its parts; None if they have none."""
@@ -150,6 +159,7 @@ class FrameViews(ProjectionStack):
         stated: exposure and beam of all frames by name, a text for each, "" if none is stated.
         marked: mask of bad pixels.
         top: greatest grey value, if less than that of the type.
+        unknown: keys of the file that its reader does not know, besides attributes of the frames.
     """
 
     def __init__(
@@ -162,13 +172,14 @@ class FrameViews(ProjectionStack):
         stated: Mapping[str, np.ndarray] | None = None,
         marked: np.ndarray | None = None,
         top: float | None = None,
+        unknown: Sequence[str] = (),
     ):
         self._frames, self._numbers, self.scan = frames, numbers, scan
         names = [f"frame {k}" for k in numbers[: VIEWS + 1].tolist()]
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig, self.detector = fields or {}, rig, frames.region
         self.stated = {name: texts[numbers].tolist() for name, texts in (stated or {}).items()}
-        self._marked, self._top = marked, top
+        self._marked, self._top, self.unknown = marked, top, [*frames.unknown, *unknown]
         if "flat" in self.fields:
             self.kind = "intensities"
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file, check_link, file_errors, shown
-from mvrecon.core.files.keys import Key, warn_of_unknown
+from mvrecon.core.files.keys import Key
 from mvrecon.data.dicom_image import DICOM, ONE_FILE, DicomImage, dicom_file, same
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures, rtk_images
@@ -163,7 +163,6 @@ class ImageFiles(ProjectionStack):
                         f"choose views of one detector by pattern=... (views.pattern)"
                     )
         where = files[0] if len(files) == 1 else files[0].parent
-        warn_of_unknown(where, (name for head in headers for name in head.unknown))
         pages = [(f, k) for f, head in zip(files, headers, strict=True) for k in range(head.pages)]
         order = _order_of(where, [place for head in headers for place in head.own], len(pages))
         self.stated = {}
@@ -175,6 +174,7 @@ class ImageFiles(ProjectionStack):
             exposures.warn_of_several(files[0].parent, name, texts, cure)
         self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm = headers[0].pixel_mm
+        self.unknown = [name for head in headers for name in head.unknown]
         self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,

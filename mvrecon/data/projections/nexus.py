@@ -12,8 +12,9 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
-from mvrecon.core.files.keys import Key
+from mvrecon.core.files.keys import EFFECTS, Key, unknown_names
 from mvrecon.data.linked import (
+    ATTRIBUTES,
     VIEW_AXES,
     MissingFile,
     Place,
@@ -24,6 +25,7 @@ from mvrecon.data.linked import (
     groups,
     listing,
     texts_at,
+    unknown_attributes,
     values_at,
 )
 from mvrecon.data.projections import exposures, nexus_axes, nexus_detector
@@ -41,7 +43,7 @@ from mvrecon.data.projections.nexus_detector import (
     there,
 )
 from mvrecon.data.projections.stack import Hdf5Views, ProjectionStack
-from mvrecon.data.storage import held, opened
+from mvrecon.data.storage import fields_with_effect, held, opened
 
 EXPECTED = (
     "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
@@ -111,13 +113,25 @@ KEYS = (
     Key("field_of_view, estimated_cor_from_motor, x_rotation_axis_pixel_position", "ignored", AXIS),
     Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
     Key(
+        "calibration_date, angular_calibration, azimuthal_angle, trigger_*, raw_time_of_flight",
+        "ignored",
+        "not of values",
+    ),
+    Key(
         "flatfield, dead_time, countrate_correction_lookup_table",
         "ignored",
         "the detector's own; flat fields correct unequal pixels",
     ),
     *nexus_detector.KEYS,
     *nexus_axes.KEYS,
+    *ATTRIBUTES,
 )
+#: Words of fields beside the frames that a warning names, and their values that change nothing.
+FIELD_EFFECTS = {
+    **EFFECTS,
+    "flip|mirror|transpos|invert|swap|polar_angle": 0,
+    "time_of_flight": None,
+}
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Units of line integrals.
@@ -376,9 +390,16 @@ class _Layout(NamedTuple):
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
         self._warn_of_moves(keys, pixel)
-        return FrameViews(
-            frames, views, fields, rig, scan, stated, *limits_of(self.detector, frames, keys)
-        )
+        limits = limits_of(self.detector, frames, keys)
+        unknown = [*self._unknown_fields(), *(n for p in angles for n in unknown_attributes(p))]
+        return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
+
+    def _unknown_fields(self) -> list[str]:
+        """Data sets beside the frames that no key knows, and that may change them."""
+        path, name, _ = self.detector or self.frames
+        group = name if self.detector else name.rpartition("/")[0] or "/"
+        with opened(path) as file:
+            return unknown_names(fields_with_effect(file[group], FIELD_EFFECTS), KEYS)
 
     def _keys(self, count: int) -> np.ndarray:
         """The image_key of each of so many frames; all are views without one."""

@@ -119,17 +119,7 @@ def translations_below(angles: Place) -> Iterator[Place]:
     Raises:
         Refused: the axis itself is turned, or the chain does not end.
     """
-    place = angles
-    for _ in range(MAX_CHAIN):
-        name = texts_at([place], "depends_on").get(place, ".").strip()
-        if name in ("", "."):
-            return
-        own = place.name.rpartition("/")[0]
-        below = followed(place.path, name if name.startswith("/") else f"{own}/{name}")
-        if below is None:
-            warnings.warn(f"{place}: depends on {shown(name)}, which is not there", stacklevel=2)
-            return
-        place = below
+    for place in _chain(angles, texts_at([angles], "depends_on").get(angles, ".")):
         kind = texts_at([place], "transformation_type").get(place, "translation")
         if kind.strip().lower() != "rotation":
             yield place
@@ -138,20 +128,46 @@ def translations_below(angles: Place) -> Iterator[Place]:
                 f"{angles}: expected an axis that no other rotation turns, got {place} of up to "
                 f"{np.abs(turned).max():g}"
             )
-    raise Refused(f"{angles}: expected at most {MAX_CHAIN} transformations by depends_on, got more")
+
+
+def _chain(place: Place, name: str) -> Iterator[Place]:
+    """The transformations on which a place depends, of which the first has this name.
+
+    Warns:
+        UserWarning: the chain leads to nothing in the file.
+
+    Raises:
+        Refused: it does not end.
+    """
+    start = place
+    for _ in range(MAX_CHAIN):
+        if (name := name.strip()) in ("", "."):
+            return
+        own = place.name.rpartition("/")[0]
+        below = followed(place.path, name if name.startswith("/") else f"{own}/{name}")
+        if below is None:
+            warnings.warn(f"{place}: depends on {shown(name)}, which is not there", stacklevel=2)
+            return
+        yield below
+        place, name = below, texts_at([below], "depends_on").get(below, ".")
+    raise Refused(f"{start}: expected at most {MAX_CHAIN} transformations by depends_on, got more")
 
 
 def warn_of_turned(detector: Place) -> None:
-    """Warn of a detector that its transformations turn, as those of mirrored frames do."""
-    if (chain := followed(detector.path, f"{detector.name}/transformations")) is None:
-        return
-    with opened(chain.path) as file:
-        names = list(group) if isinstance(group := file[chain.name], h5py.Group) else []
-    for name in names:
-        if (place := followed(chain.path, f"{chain.name}/{name}")) is None:
-            continue
-        kind = texts_at([place], "transformation_type").get(place, "")
-        turns = kind.strip().lower() == "rotation" or (not kind and name in ("rx", "ry", "rz"))
+    """Warn of a detector that its transformations turn, as those of mirrored frames do: those in
+    its group `transformations`, and of the chain of its `depends_on`.
+    """
+    places = []
+    if (chain := followed(detector.path, f"{detector.name}/transformations")) is not None:
+        with opened(chain.path) as file:
+            names = list(group) if isinstance(group := file[chain.name], h5py.Group) else []
+        places += [followed(chain.path, f"{chain.name}/{name}") for name in names]
+    if (first := followed(detector.path, f"{detector.name}/depends_on")) is not None:
+        places += _chain(first, texts_at([first], "").get(first, "."))
+    for place in dict.fromkeys(place for place in places if place is not None):
+        name, kind = place.name.rpartition("/")[2], texts_at([place], "transformation_type")
+        kind = kind.get(place, "").strip().lower()
+        turns = kind == "rotation" or (not kind and name in ("rx", "ry", "rz"))
         if turns and values_at(place, ("units", *ATTRIBUTES)).any():
             warnings.warn(
                 f"{place}: the detector is turned; without views.flip_columns=true or "

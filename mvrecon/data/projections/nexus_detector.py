@@ -24,6 +24,7 @@ VIEW, FLAT, DARK, INVALID, ALIGNMENT = 0, 1, 2, 3, -1
 DETECTOR_BEAM = (
     *("gain_setting", "threshold_energy", "flatfield_applied", "pixel_mask_applied"),
     *("countrate_correction_applied", "angular_calibration_applied"),
+    "virtual_pixel_interpolation_applied",
 )
 BEAM = (
     *("instrument/beam/incident_energy", "instrument/beam/incident_wavelength"),

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.keys import warn_of_unknown
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file, same
 from mvrecon.data.linked import Place, followed, listing, values_at
@@ -188,7 +189,7 @@ def mean_field(
 
     Warns:
         UserWarning: images of a flat field that differ, or a field of another exposure or beam than
-            the views, unless a file states exposures.
+            the views, unless a file states exposures; unknown keys that the views do not have.
 
     Raises:
         Refused: several, no flat one, or one of another size or another part of the detector.
@@ -216,6 +217,7 @@ def mean_field(
                 f"{stack.path}: expected a {name} field with the {key} {own} of the views, got "
                 f"{other}; pixels must be those of the views"
             )
+    warn_of_unknown(stack.path, sorted({*stack.unknown} - {*views.unknown}))
     mean, levels = stack.mean()
     least, most = levels.min().item(), levels.max().item()
     if name == "flat" and most - least > MAX_FLAT_CHANGE * levels.mean().item():

@@ -10,22 +10,50 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import Key, check_keys, unknown_names
+from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import Header
+from mvrecon.data.projections.tiff import EXIF_BEAM
 
 #: Pixel types of a grey PNG by Pillow's mode.
 MODES = {"1": "?", "L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
-#: Tag of EXIF for the order of rows and columns.
-ORIENTATION = 274
-#: Chunks and fields of PNG that change the pixels.
+#: Tag of the camera's part of EXIF.
+CAMERA = 0x8769
+#: Chunks of texts.
+TEXTS = ("tEXt", "zTXt", "iTXt")
+#: Chunks and fields of PNG that change the pixels, and those that ordinary files have; a warning
+#: names all others.
 PNG_KEYS = (
+    Key("IHDR, IDAT, IEND", "applied"),
     Key("bit depth", "refused", "1 in masks alone; Pillow rescales 2 and 4 bits", (1, 8, 16)),
     Key("colour type", "refused", "grey values", (0,)),
     Key("interlace method", "applied"),
     Key("acTL", "refused", "one image in each file"),
     Key("pCAL", "refused", "store the values that the calibration gives"),
+    Key("sTER", "refused", "one image, not a pair beside each other"),
     Key("eXIf: Orientation", "refused", "the first pixel is at the upper left", (1,)),
-    Key("gAMA, sRGB, iCCP, cICP, cHRM, tRNS", "ignored", "display alone"),
+    Key("eXIf: Gamma", "refused", "linear values", (1,)),
+    Key(
+        ", ".join(f"eXIf: {name}" for name in ("ExposureTime", *EXIF_BEAM)),
+        "compared",
+        "of all views and of flat fields, as those of TIFF",
+    ),
+    Key(
+        "text: ...",
+        "compared",
+        "entries such as `slope = 2`, with what changes nothing; a warning names them",
+    ),
+    Key(", ".join(TEXTS), "ignored", "other texts"),
+    Key(
+        "gAMA, sRGB, iCCP, cICP, cHRM, tRNS, bKGD, PLTE, sPLT, hIST, mDCV, cLLI",
+        "ignored",
+        "display alone",
+    ),
+    Key(
+        "tIME, eXIf, dSIG, iDOT, vpAg, caNv, gIFg, gIFx",
+        "ignored",
+        "date, origin, canvas and order of writing",
+    ),
     Key("pHYs, oFFs, sCAL", "ignored", "origin and print size"),
     Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
 )
@@ -45,15 +73,43 @@ def png_header(file: Path) -> Header:
             bits, colours = struct.unpack_from("BB", raw.read(26), 24)
         chunks = dict.fromkeys((name for name, _ in _chunks(file)), "one")
         stated = {"bit depth": bits, "colour type": colours, **chunks}
-        stated["eXIf: Orientation"] = image.getexif().get(ORIENTATION) if "eXIf" in chunks else None
+        exif = _exif(image) if "eXIf" in chunks else {}
+        stated |= {f"eXIf: {name}": value for name, value in exif.items()}
         check_keys(file, PNG_KEYS, stated.get)
+        texts = image.text.items() if {*TEXTS} & {*chunks} else ()
+        entries = [
+            f"text: {entry}"
+            for name, text in texts
+            for entry in descriptions.effects(f"{name}: {text}")
+        ]
         kind = MODES.get(image.mode)
         if kind is None or max(rows, columns) > EDGE:
             raise Refused(
                 f"{file}: expected grey values of at most {EDGE} x {EDGE} pixels, got {rows} x "
                 f"{columns} of the type {image.mode}"
             )
-        return Header((rows, columns), np.dtype(kind), 1, frozenset([2.0**bits - 1]))
+        head = Header((rows, columns), np.dtype(kind), 1, frozenset([2.0**bits - 1]))
+        stated = {
+            name: f"{exif[name]:g}" if isinstance(exif[name], float) else str(exif[name])
+            for name in EXIF_BEAM
+            if name in exif
+        }
+        if (time := exif.get("ExposureTime")) is not None:
+            stated["ExposureTime"] = descriptions.milliseconds(file, float(time), "s")
+        head = head._replace(stated={name: [text] for name, text in stated.items()})
+        return head._replace(unknown=unknown_names([*chunks, *entries], PNG_KEYS))
+
+
+def _exif(image: Any) -> dict[str, Any]:
+    """The entries of EXIF by their names; ratios as numbers."""
+    from PIL import ExifTags
+    from PIL.TiffImagePlugin import IFDRational
+
+    exif = image.getexif()
+    return {
+        ExifTags.TAGS.get(tag, str(tag)): float(value) if isinstance(value, IFDRational) else value
+        for tag, value in {**exif, **exif.get_ifd(CAMERA)}.items()
+    }
 
 
 def png_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:

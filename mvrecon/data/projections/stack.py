@@ -20,8 +20,9 @@ from torch import Tensor
 
 from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
 from mvrecon.core.machine import check_memory
+from mvrecon.data.attenuation import check_unit_of_views
 from mvrecon.data.itk import itk_image
-from mvrecon.data.linked import VIEW_AXES, Place, check_order
+from mvrecon.data.linked import VIEW_AXES, Place, check_order, unknown_attributes
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
 from mvrecon.geometry.cameras.camera import Cameras
 
@@ -125,6 +126,8 @@ class ProjectionStack(ABC):
     stated: Mapping[str, Sequence[str]] = {}
     #: What the files state of the detector, by name, which fields have in common with their views.
     detector: Mapping[str, Any] = {}
+    #: Keys of the files that their reader does not know, and that may change values or geometry.
+    unknown: Sequence[str] = ()
     #: Name and options of the camera that the file states, those of the detector without pixels;
     #: the name is None where it states no beam.
     rig: Mapping[str, Any] | None = None
@@ -348,6 +351,9 @@ class Hdf5Views(ProjectionStack):
                 self.duration_s = _positive(path, views, "duration", required=False)
                 if self.unit is None or " of " in self.unit:  # else of line integrals
                     self.kind = "counts"
+            if self.unit is not None:
+                check_unit_of_views(self.unit, f"{path}: ")
+            self.unknown = unknown_attributes(Place(path, "/views"), ATTRIBUTES)
             names = [f"view {k}" for k in range(len(views))]
             super().__init__(path, names, views.shape[1:], views.dtype)
 

@@ -11,18 +11,35 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, shown, text_of
-from mvrecon.core.files.keys import Key, check_keys, has_effect
+from mvrecon.core.files.keys import Key, check_keys, has_effect, unknown_names
 from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
 #: Tags of EXIF on which grey values depend, but not in a proportion that all cameras share.
 EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureBiasValue")
-#: Those of them that are stored as numerator and denominator.
-RATIOS = ("FNumber", "ExposureBiasValue")
+#: Tags that are stored as numerator and denominator.
+RATIOS = ("FNumber", "ExposureBiasValue", "Gamma", "BestQualityScale", "MDScalePixel")
 #: Items of GDAL that scale values: the role, and the number.
 SCALED = re.compile(r"<Item\b[^>]*\brole\s*=\s*[\"'](scale|offset)[\"'][^>]*>\s*([^<]*?)\s*<")
-#: Tags of TIFF that change the pixels or their order.
+#: Tags of Andor on which grey values depend likewise, beside its ExposureTime.
+ANDOR_BEAM = tuple(
+    f"Andor{name}"
+    for name in (
+        *("Accumulations", "PhotonCounting", "EmDacLevel", "PreAmpSetting", "BaselineClamp"),
+        *("BaselineOffset", "HorizontalFlip", "VerticalFlip", "Clockwise", "CounterClockwise"),
+    )
+)
+#: First tag of areaDetector's attributes, which are texts `name:value`.
+AREA_DETECTOR = 65010
+#: Tags of TIFF that change the pixels or their order, and those that ordinary files have; a warning
+#: names all others.
 TIFF_KEYS = (
+    Key(
+        "ImageWidth, ImageLength, StripOffsets, StripByteCounts, RowsPerStrip, TileWidth, "
+        "TileLength, TileOffsets, TileByteCounts, PlanarConfiguration, JPEG*, LercParameters, "
+        "YCbCr*, T4Options, T6Options",
+        "applied",
+    ),
     Key("BitsPerSample", "applied", "also gives the largest grey value"),
     Key("SampleFormat", "applied", "integers and floats of any width; one bit in masks alone"),
     Key("Compression", "applied"),
@@ -58,12 +75,33 @@ TIFF_KEYS = (
         "compared",
         "of all views, also in EXIF, in ms as in DICOM; warned of, applied by views.exposure",
     ),
+    Key("AndorExposureTime", "compared", "as ExposureTime, in s"),
     Key(", ".join(EXIF_BEAM), "compared", "of views and flat fields, also in EXIF; warned of"),
+    Key(", ".join(ANDOR_BEAM), "compared", "of views and flat fields; warned of"),
+    Key(
+        "ImageDescription: ..., areaDetector: ...",
+        "compared",
+        "entries of other programs, such as `slope = 2`, with what changes nothing; a warning "
+        "names them",
+    ),
+    Key("Gamma", "refused", "linear values, also in EXIF", (1,)),
+    Key("OpcodeList1", "refused", "store the values that its operations give"),
+    Key("OpcodeList2", "refused", "store the values that its operations give"),
+    Key("OpcodeList3", "refused", "store the values that its operations give"),
+    Key("BestQualityScale", "refused", "store the image at this scale", (1,)),
+    Key("RowInterleaveFactor", "refused", "rows in their order", (1,)),
+    Key("ColumnInterleaveFactor", "refused", "columns in their order", (1,)),
+    Key("SubTileBlockSize", "refused", "pixels in their order", ((1, 1),)),
+    Key("StripRowCounts", "refused", "strips of equal heights, RowsPerStrip"),
+    Key("Indexed", "refused", "grey values, not indices of colours", (0,)),
+    Key("OPIProxy", "refused", "full images, not reduced ones", (0,)),
+    Key("DataType", "refused", "state SampleFormat instead", (2,)),
+    Key("AdventScale", "refused", "store the values that the factor gives"),
     Key("Decode", "refused", "store the values of its range"),
     Key("StoNits", "refused", "store the values that the factor gives", (1,)),
     Key("SubfileType", "refused", "full images, not reduced ones", (1, 3)),
     Key("MDFileTag", "refused", "linear values, not square roots", (128,)),
-    Key("MDScalePixel", "refused", "store the values that the factor gives", ((1, 1),)),
+    Key("MDScalePixel", "refused", "store the values that the factor gives", (1,)),
     Key("GDAL_METADATA", "refused", "with a scale or an offset; store the values they give"),
     Key("GDAL_NODATA", "refused", "replace pixels without data, and remove the tag"),
     Key(
@@ -99,7 +137,51 @@ TIFF_KEYS = (
     Key(
         "MinSampleValue, MaxSampleValue, SMinSampleValue, SMaxSampleValue", "ignored", "statistics"
     ),
-    Key("BaselineExposure", "ignored", "of the display"),
+    Key(
+        "BaselineExposure, ColorMap, GrayResponseUnit, ColorResponseUnit, TransferRange, "
+        "Thresholding, CellWidth, CellLength, HalftoneHints, WhitePoint, PrimaryChromaticities, "
+        "InterColorProfile, ICCProfileDescriptor, SRGBRenderingIntent, ColorSpace",
+        "ignored",
+        "of the display",
+    ),
+    Key(
+        "DocumentName, ImageDescription, Make, Model, PageName, Software, DateTime*, Artist, "
+        "HostComputer, Copyright, XMP, IPTCNAA, ImageResources, ImageTitle, ImageID, "
+        "ImageUniqueID, OriginalFileName, ProcessingSoftware, XPTitle, XPComment, XPAuthor, "
+        "XPKeywords, XPSubject, Rating*, Padding, OffsetSchema",
+        "ignored",
+        "texts",
+    ),
+    Key("FreeOffsets, FreeByteCounts, ExtraSamples, SubIFDs", "ignored", "no pixels of the image"),
+    Key("Thumbnail*", "ignored", "reduced images"),
+    Key(
+        "XPosition, YPosition, ModelPixelScaleTag, ModelTiepointTag, ModelTransformationTag, Geo*, "
+        "GEO_METADATA, RPCCoefficientTag, GPSTag",
+        "ignored",
+        "the camera decides",
+    ),
+    Key("BlackLevelRepeatDim, DNGVersion, DNGBackwardVersion", "ignored", "of BlackLevel, texts"),
+    Key(
+        "ExifTag, ExifVersion, Exposure*, Spectral*, SensitivityType, StandardOutputSensitivity, "
+        "RecommendedExposureIndex, ISOSpeedLatitude*, OffsetTime*, SubsecTime*, "
+        "ComponentsConfiguration, CompressedBitsPerPixel, ShutterSpeedValue, ApertureValue, "
+        "BrightnessValue, MaxApertureValue, Subject*, MeteringMode, LightSource, Flash*, "
+        "FocalLength*, FocalPlane*, SensingMethod, MakerNote, UserComment, Temperature, Humidity, "
+        "Pressure, PixelXDimension, PixelYDimension, Interoperability*, FileSource, Scene*, "
+        "CustomRendered, WhiteBalance, Contrast, Saturation, Sharpness, "
+        "DeviceSettingDescription, DigitalZoomRatio, CameraOwnerName, BodySerialNumber, Lens*, "
+        "UniqueCameraModel, CameraSerialNumber, BatteryLevel, TimeZoneOffset, SelfTimerMode, "
+        "Related*",
+        "ignored",
+        "of EXIF",
+    ),
+    Key(
+        "IJMetadata*, MicroManagerMetadata, UIC1tag, UIC3tag, UIC4tag, CZ_SEM, CZ_LSMINFO, "
+        "FEI_*, FibicsXML, JEOL_Header, MM_*, OlympusINI, OlympusSIS*, PCO_RAW, Andor*, "
+        "tag 65000, tag 65001, tag 65002, tag 65003",
+        "ignored",
+        "what the programs of microscopes and cameras store beside the pixels",
+    ),
     *descriptions.KEYS,
 )
 
@@ -114,8 +196,10 @@ def tiff_header(file: Path) -> Header:
                 f"got {len(pages)}; save the stack as an image sequence"
             )
         first, numbers, stated = _page_header(file, pages[0], images), [], []
+        found: set[str] = set()
         for page in pages:
             _check_tags(file, page)
+            found |= _names(page)
             head = _page_header(file, page, images)
             stated.append({name: texts[0] for name, texts in head.stated.items()})
             if head._replace(stated=first.stated) != first:
@@ -144,6 +228,7 @@ def tiff_header(file: Path) -> Header:
         texts = {name: [one.get(name, "") for one in stated] for name in names}
         head = first._replace(stated=texts)
         first = descriptions.of_file(file, head, text, own)._replace(places=places, own=own)
+        first = first._replace(unknown=unknown_names(sorted(found), TIFF_KEYS))
     if _offset(pages[0]):
         return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return first
@@ -172,6 +257,20 @@ def _check_tags(file: Path, page: Any) -> None:
             f"{file}: expected {tags} tags of page {page.index} within {handle.size} bytes, got "
             f"{len(ends)} up to byte {max(ends, default=0)}; is it cut short?"
         )
+
+
+def _names(page: Any) -> set[str]:
+    """Names of the tags of a page and of its EXIF, and of entries of texts that change values."""
+    names = {str(name) for name in page.tags.valueof("ExifTag") or ()}
+    texts = {"ImageDescription": [page.description]}
+    for tag in page.tags:
+        if tag.code >= AREA_DETECTOR and isinstance(tag.value, str):
+            texts.setdefault("areaDetector", []).append(tag.value)
+        else:
+            names.add(f"tag {tag.name}" if tag.name.isdigit() else tag.name)
+    for where, own in texts.items():
+        names |= {f"{where}: {entry}" for text in own for entry in descriptions.effects(text)}
+    return names
 
 
 def _described(page: Any) -> dict[str, str]:
@@ -251,14 +350,20 @@ def _check_order(
         )
 
 
+def _number(tag: str, value: Any) -> Any:
+    """The number of a tag that is stored as a ratio; the value of others."""
+    ratio = tag in RATIOS and isinstance(value, tuple) and len(value) == 2 and value[1]
+    return value[0] / value[1] if ratio else value
+
+
 def _page_header(file: Path, page: Any, pages: int) -> Header:
-    described = _described(page)
+    described, exif = _described(page), page.tags.valueof("ExifTag") or {}
 
     def value_of(name: str) -> Any:
         tag, _, entry = name.partition(": ")
         if entry:
             return described.get(entry)
-        found = page.tags.valueof(tag)
+        found = _number(tag, page.tags.valueof(tag, exif.get(tag)))
         if tag == "GDAL_METADATA":
             items = SCALED.findall(str(found or ""))
             return [f"{role} {value}" for role, value in items if has_effect(role, value)]
@@ -279,15 +384,15 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
         )
     bits = page.bitspersample - (kind.kind == "i")
     top = None if kind.kind == "f" else float(2**bits - 1)
-    exif = page.tags.valueof("ExifTag") or {}
-    exposed = (page.tags.valueof("ExposureTime"), exif.get("ExposureTime"))
+    exposed = [page.tags.valueof(name) for name in ("ExposureTime", "AndorExposureTime")]
+    exposed.append(exif.get("ExposureTime"))
     ratios = [s if isinstance(s, tuple) else (s, 1) for s in exposed if s is not None]
     times = {descriptions.milliseconds(file, s / unit, "s") for s, unit in ratios if unit}
     stated = {"ExposureTime": [" or ".join(sorted(times))]}
-    for name in EXIF_BEAM:
+    for name in (*EXIF_BEAM, *ANDOR_BEAM):
         if (value := exif.get(name, page.tags.valueof(name))) is not None:
-            ratio = isinstance(value, tuple) and name in RATIOS and value[1] != 0
-            stated[name] = [f"{value[0] / value[1]:g}" if ratio else str(value)]
+            number = _number(name, value)
+            stated[name] = [f"{number:g}" if isinstance(number, float) else str(number)]
     head = Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
     manager = page.tags.valueof("MicroManagerMetadata")
     return descriptions.of_page(file, head, page.description, manager)

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.keys import warn_of_unknown
 from mvrecon.core.machine import check_memory
 from mvrecon.data.projections.faults import (
     FEWEST_VIEWS,
@@ -75,7 +76,8 @@ class MeasuredViews:
         options: options of the files and of their correction.
 
     Warns:
-        UserWarning: at the first reading, pixels that measure wrongly, with their places.
+        UserWarning: keys of the files that no reader knows and that may change values; at the first
+            reading, pixels that measure wrongly, with their places.
 
     Raises:
         FileNotFoundError, ImportError: see `open_projections`.
@@ -90,6 +92,7 @@ class MeasuredViews:
             options.path, options.pattern, options.gaps, own, options.layout, **names
         )
         self.options, self.stack = options, stack
+        warn_of_unknown(stack.path, stack.unknown)
         self.region = Region(stack.shape, options.rows, options.columns, options.binning)
         whole = stack.dtype.kind != "f"
         if options.kind == "integrals" and whole:

@@ -88,6 +88,7 @@ def test_the_greatest_value_of_packed_bits_is_saturation(bits, tmp_path):
         assert torch.equal(measured.whole().mask[0], expected)
 
 
+OPCODES = (51008, 51009, 51022)
 TAGS = {
     "Orientation": (274, "H", 1, 6),
     "NewSubfileType": (254, "I", 1, 1),
@@ -102,6 +103,20 @@ TAGS = {
     "DefaultScale": (50718, "2I", 2, (2, 1, 1, 1)),
     "WhiteLevel": (50717, "I", 1, 4000),
     "Decode": (433, "d", 2, (0.0, 5.0)),
+    "Gamma": (42240, "2I", 1, (22, 10)),
+    **{
+        f"OpcodeList{k}": (code, "B", 4, (0, 0, 0, 1))
+        for k, code in zip("123", OPCODES, strict=True)
+    },
+    "BestQualityScale": (50780, "2I", 1, (2, 1)),
+    "RowInterleaveFactor": (50975, "H", 1, 2),
+    "ColumnInterleaveFactor": (52547, "H", 1, 2),
+    "SubTileBlockSize": (50974, "H", 2, (2, 2)),
+    "StripRowCounts": (559, "I", 2, (2, 4)),
+    "Indexed": (346, "H", 1, 1),
+    "OPIProxy": (351, "H", 1, 1),
+    "DataType": (32996, "H", 1, 3),
+    "AdventScale": (33589, "d", 1, 2.0),
     "StoNits": (37439, "d", 1, 2.0),
     "SubfileType": (255, "H", 1, 2),
     "MDFileTag": (33445, "I", 1, 2),

@@ -1,0 +1,302 @@
+"""Keys that no reader knows: those that change values or geometry are refused or named, in one
+warning of all files; ordinary ones are read without.
+
+Truth: the names by which tifffile, Pillow, h5py and the definitions of NeXus write them. Tried
+beside these: all 667 names in tifffile's registry, 45 tags and 30 descriptions in files, EXIF of a
+camera, 15 files of tifffile, Pillow and SimpleITK, and HDF5 as DLS, the ESRF, the APS and netCDF
+write it.
+"""
+
+import struct
+import warnings
+import zlib
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+import torch
+from PIL import Image as Pillow
+from PIL.PngImagePlugin import PngInfo
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.training.export import save_views
+from tests.data.projections.conftest import grey, opened
+from tests.data.projections.test_nexus import KEYS, exchange, tomo
+
+GIVEN = {"flat": 60_000.0, "find_bad_pixels": False}
+
+
+def named(path, **options):
+    """The keys that a single warning of the views names; none without a warning."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(path, **{"find_bad_pixels": False, **options})
+    assert len(caught) <= 1, [str(one.message) for one in caught]
+    parts = [str(one.message).split("does not know: ")[1].split("; ")[0] for one in caught]
+    return parts[0].split(", ") if parts else []
+
+
+def tiffs(folder, tags=(), text=None, values=None):
+    """A folder of images with these tags and this description."""
+    for k, view in enumerate(grey()[:3] if values is None else values):
+        options = {"photometric": "minisblack", "metadata": None, "description": text}
+        tags = [(*tag[:4], True) for tag in tags]
+        tifffile.imwrite(folder / f"{k}.tif", view, extratags=tags, **options)
+    return folder
+
+
+BLOB = bytes(range(40))
+TAGS = {
+    "of texts": ([(271, "s", 0, "a"), (306, "s", 0, "b"), (315, "s", 0, "c")], []),
+    "of colours, texts and GeoTIFF": (
+        [(34675, "B", 40, BLOB), (700, "B", 4, b"<x/>"), (33550, "d", 3, (1.0, 1.0, 0.0))],
+        [],
+    ),
+    "of cameras": ([(50495, "B", 40, BLOB), (4869, "d", 1, -70.0), (4944, "d", 1, 100.0)], []),
+    "of areaDetector": ([(65000, "d", 1, 1e9), (65001, "I", 1, 5), (65010, "s", 0, "Model:x")], []),
+    "an offset of areaDetector": (
+        [(65010, "s", 0, "Model:x"), (65027, "s", 0, "DataOffset:100")],
+        ["areaDetector: DataOffset"],
+    ),
+    "a private tag": ([(40123, "I", 1, 5)], ["tag 40123"]),
+    "NIH Image's calibration": ([(43314, "B", 40, BLOB)], ["NIHImageHeader"]),
+    "a matrix and a crop": (
+        [(32956, "d", 9, (1.0,) * 9), (50719, "I", 2, (1, 1))],
+        ["AffineTransformMat", "DefaultCropOrigin"],
+    ),
+    "a gamma of 1": ([(42240, "2I", 1, (1, 1)), (50975, "H", 1, 1)], []),
+}
+
+
+@pytest.mark.parametrize("case", TAGS)
+def test_tags_that_no_reader_knows_are_named(case, tmp_path):
+    """One warning of a folder with its dark and flat fields."""
+    tags, expected = TAGS[case]
+    assert named(tiffs(tmp_path, tags), **GIVEN) == expected
+    for name, value in (("dark", 0), ("flat", 60_000)):
+        field = np.full(grey()[0].shape, value, "u2")
+        extra = [(*tag, True) for tag in tags]
+        tifffile.imwrite(tmp_path / f"{name}.tif", field, metadata=None, extratags=extra)
+    assert named(tmp_path) == expected
+
+
+def test_a_tag_of_one_page_and_of_a_cameras_exif_is_named(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for k, view in enumerate(grey()):
+            tags = [(40123, "I", 1, 5, True)] if k == 7 else []
+            file.write(view, photometric="minisblack", metadata=None, extratags=tags)
+    assert named(tmp_path / "a.tif", **GIVEN) == ["tag 40123"]
+    for gamma in (1.0, 2.2):
+        exif = Pillow.Exif()
+        exif.get_ifd(0x8769).update({42240: gamma, 42080: 3, 37510: b"ASCII\0\0\0a", 41985: 0})
+        exif[0x8769] = dict(exif.get_ifd(0x8769))
+        Pillow.fromarray(grey()[0]).save(tmp_path / "b.tif", exif=exif)
+        options = {"layout": "projections", **GIVEN}
+        if gamma == 1:
+            assert named(tmp_path / "b.tif", **options) == ["CompositeImage"]
+            continue
+        with pytest.raises(Refused, match="Gamma"):
+            opened(tmp_path / "b.tif", **options)
+
+
+TEXTS = {
+    "a scan of a shell, 0.5 mm of aluminium": [],
+    "slope=1\nintercept=0.0": [],
+    "date=1\nslope=2": ["slope"],
+    "Rescale Slope: 2\nRescale Intercept: -1000": ["Rescale Intercept", "Rescale Slope"],
+    "gain=1 offset=5": ["offset"],
+    "Exposure=2;Bias=100;": ["Bias"],
+    "Detector:slope=2\nPixel: offset=100\nLens: gain=1": ["offset", "slope"],
+    '{"camera": {"scale": [0.01, 1]}, "offset": [0, 0], "gain": {"value": 2}}': ["gain", "scale"],
+    "Slope\t2\nIntercept\t0": ["Slope"],
+    "<a><slope>0.5</slope><b offset='3'/></a>": ["b offset", "slope"],
+    '<a><Item name="scale">3</Item><p name="gain" value="4"/></a>': ["gain", "scale"],
+    "unit=mm": [],
+    "Units: optical density": ["Units"],
+    "ImageJ=1.54f\nunit=micron\nvunit=Gray Value\nmin=0.0": [],
+    "ImageJ=1.54f\ngain=3": ["gain"],
+    "SCIFIO=0.37\nscales=0.5,0.5\nunits=micron,micron\nimages=1": [],
+    '<MetaData><prop id="autoscale-state" value="on"/></MetaData>': [],
+    "x" * 10**6 + "gain": [],
+}
+
+
+@pytest.mark.parametrize("text", TEXTS, ids=lambda text: text[:30])
+def test_entries_of_a_description_that_may_change_values_are_named(text, tmp_path):
+    found = named(tiffs(tmp_path, text=text), **GIVEN)
+    assert found == [f"ImageDescription: {name}" for name in TEXTS[text]]
+
+
+def test_the_texts_of_a_detector_of_dectris_are_known(tmp_path):
+    text = (
+        "# Pixel_size 172e-6 m x 172e-6 m\n# Exposure_time 1.0 s\n# Tau = 0 s\n"
+        "# Gain_setting high gain (vrf = -0.2)\n# Detector_Voffset 0.0000 m\n"
+        "# Threshold_setting 7 keV\n# Count_cutoff 104857 counts\n"
+    )
+    assert named(tiffs(tmp_path, text=text, values=grey()[:3].astype("i4")), **GIVEN) == []
+    tiffs(tmp_path, text=text + "# Pedestal_offset 12\n", values=grey()[:3].astype("i4"))
+    assert named(tmp_path, **GIVEN) == ["ImageDescription: Pedestal_offset"]
+
+
+CHUNKS = {
+    "ordinary": ([(b"pHYs", bytes(9)), (b"iDOT", bytes(28))], [("Comment", "a: b")], []),
+    "private": ([(b"prVt", b"a"), (b"orNT", b"\3")], [], ["prVt", "orNT"]),
+    "a scale": (
+        [],
+        [("Scale", "0.5"), ("Comment", "a=1\nslope=2")],
+        ["text: Scale", "text: slope"],
+    ),
+    "a scale of 1": ([], [("Scale", "1"), ("Software", "a")], []),
+}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("case", CHUNKS)
+def test_chunks_and_texts_of_png_that_no_reader_knows_are_named(case, packed, tmp_path):
+    chunks, texts, expected = CHUNKS[case]
+    for k in range(3):
+        about, path = PngInfo(), tmp_path / f"{k}.png"
+        for key, text in texts:
+            about.add_text(key, text, zip=packed)
+        Pillow.fromarray(grey()[k]).save(path, pnginfo=about)
+        heads = [struct.pack(">I", len(body)) + name + body for name, body in chunks]
+        more = b"".join(head + struct.pack(">I", zlib.crc32(head[4:])) for head in heads)
+        path.write_bytes(path.read_bytes()[:33] + more + path.read_bytes()[33:])
+    assert named(tmp_path, **GIVEN) == expected
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({33434: 0.02}, "values of ExposureTime, 10 or 20"),
+        ({34855: 200}, "values of ISOSpeedRatings"),
+        ({42240: 2.2}, "eXIf: Gamma 1, got 2.2"),
+        ({42240: 1.0}, None),
+    ],
+)
+def test_exif_of_png_is_compared_as_that_of_tiff(entries, message, tmp_path):
+    for k in range(3):
+        exif = Pillow.Exif()
+        camera = {33434: 0.01, 34855: 100, 33437: 8.0, **(entries if k == 1 else {})}
+        exif.get_ifd(0x8769).update(camera)
+        exif[0x8769] = dict(exif.get_ifd(0x8769))
+        Pillow.fromarray(grey()[k]).save(tmp_path / f"{k}.png", exif=exif)
+    if message is None:
+        assert named(tmp_path, **GIVEN) == []
+    elif message.startswith("eXIf"):
+        with pytest.raises(Refused, match=message):
+            opened(tmp_path, **GIVEN)
+    else:
+        with pytest.warns(UserWarning, match=message):
+            opened(tmp_path, **GIVEN)
+
+
+FRAMES = "entry/instrument/detector/data"
+ATTRIBUTES = {
+    "ordinary": (
+        {
+            **{"NX_class": "a", "long_name": "b", "target": "/c", "signal": 1, "CLASS": "IMAGE"},
+            **{"interpretation": "image", "IMAGE_SUBCLASS": "IMAGE_GRAYSCALE", "PALETTE": 1},
+            **{
+                "flip": False,
+                "mirrored": 0,
+                "DISPLAY_ORIGIN": "UL",
+                "MATLAB_class": "uint16",
+                "coordinates": "a b",
+            },
+        },
+        [],
+    ),
+    "other": ({"flatfield_corrected": True, "log": 1}, ["data@flatfield_corrected", "data@log"]),
+    "a range": ({"min": 0.0, "max": 5.0}, ["data@max", "data@min"]),
+    "rows upwards": ({"DISPLAY_ORIGIN": "LL"}, "DISPLAY_ORIGIN UL, got 'll'"),
+    "indices of colours": ({"IMAGE_SUBCLASS": np.bytes_("IMAGE_INDEXED")}, "IMAGE_SUBCLASS"),
+    "a valid range": ({"valid_range": [0, 100]}, "valid_range"),
+}
+
+
+@pytest.mark.parametrize("case", ATTRIBUTES)
+def test_attributes_of_frames_that_no_reader_knows_are_named(case, tmp_path):
+    """Of NXtomo, of Data Exchange, and of any data set."""
+    attributes, expected = ATTRIBUTES[case]
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["data"] = grey()
+    for path, place, options in (
+        (tomo(tmp_path / "a.nxs"), FRAMES, {}),
+        (exchange(tmp_path / "b.h5"), "exchange/data", {}),
+        (tmp_path / "c.h5", "data", {"dataset": "data", **GIVEN}),
+    ):
+        with h5py.File(path, "a") as file:
+            file[place].attrs.update(attributes)
+        if isinstance(expected, list):
+            assert sorted(named(path, **options)) == expected
+            continue
+        with pytest.raises(Refused, match=f"(?i){expected}"):
+            opened(path, **options)
+
+
+FIELDS = {
+    "ordinary": (
+        {
+            **{"detector_number": 1, "x_pixel_offset": np.arange(8.0), "distance": 1.0},
+            **{"calibration_date": "2020", "polar_angle": 0.0, "gain": 1.0, "bias": 0},
+            **{"efficiency": 0.9, "frame_start_number": 1, "flip_rows": False, "depends_on": "."},
+        },
+        [],
+    ),
+    "scales": ({"gain": 2.0, "black_offset": 100}, ["black_offset", "gain"]),
+    "geometry": ({"polar_angle": 12.0, "flip_rows": True}, ["flip_rows", "polar_angle"]),
+    "another axis": ({"time_of_flight": np.arange(9.0)}, ["time_of_flight"]),
+}
+
+
+@pytest.mark.parametrize("case", FIELDS)
+def test_fields_of_a_detector_that_may_change_its_frames_are_named(case, tmp_path):
+    sets, expected = FIELDS[case]
+    path = tomo(tmp_path / "a.nxs", **{f"instrument__detector__{k}": v for k, v in sets.items()})
+    assert named(path) == expected
+
+
+def test_other_names_of_a_scan_in_hdf5_are_named(tmp_path):
+    """Of the angles; of the parts of virtual frames, and of sinograms by any name."""
+    path = tomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        file["entry/sample/rotation_angle"].attrs.update(direction="cw", long_name="theta")
+    assert named(path) == ["rotation_angle@direction"]
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["raw"] = grey()
+        file["raw"].attrs["inverted"] = True
+    options = {"dataset": "raw", "layout": "sinogram", **GIVEN}
+    assert named(tmp_path / "b.h5", **options) == ["raw@inverted"]
+
+
+@pytest.mark.parametrize("angle", [0.0, 180.0])
+def test_a_detector_that_depends_on_a_rotation_elsewhere_is_warned_of(angle, tmp_path):
+    """By the chain of its field depends_on, as newer files of NeXus state it."""
+    stage = {"instrument__detector__depends_on": "/entry/stage/tilt", "stage__tilt": angle}
+    path = tomo(tmp_path / "a.nxs", **stage)
+    with h5py.File(path, "a") as file:
+        file["entry/stage/tilt"].attrs.update(transformation_type="rotation", depends_on=".")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert opened(path).n_views == (KEYS == 0).sum()
+    assert any("detector is turned" in str(one.message) for one in caught) is (angle != 0)
+
+
+@pytest.mark.parametrize("unit", ["ADU", "counts/s", "mm", "", "arbitrary units of light"])
+def test_a_unit_of_views_that_mvrecon_cannot_interpret_is_refused(unit, tmp_path):
+    """At reading, also of counts by their dose, and at writing."""
+    for about in ({"unit": unit}, {"unit": "counts", "dose": 2.0, "unit_per_dose": unit}):
+        with h5py.File(tmp_path / "views.h5", "w") as file:
+            file.create_dataset("views", data=grey().astype("f4")).attrs.update(about)
+        with pytest.raises(Refused, match=f"unit of views .* got '{unit}'"):
+            opened(tmp_path / "views.h5")
+    with pytest.raises(Refused, match=f"got '{unit}'"):
+        save_views(tmp_path, "a", torch.ones(3, 4, 5), unit)
+
+
+@pytest.mark.parametrize("unit", ["1/mm * mm", "1/mm", "1", "activity * mm", "spect of activity"])
+def test_units_of_views_that_are_written_are_read(unit, tmp_path):
+    stored = save_views(tmp_path, "a", torch.ones(3, 4, 5), unit)
+    assert opened(stored / "views.h5").stack.unit == unit
