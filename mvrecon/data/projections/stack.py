@@ -52,6 +52,7 @@ class Header(NamedTuple):
         excluded: where negative values mark bad pixels, the number of these that the file states.
         places: for a set of files, the places of the pages of each, by the file's path.
         own: those of the pages of this file.
+        unknown: entries that may change values or places, and that no reader knows.
     """
 
     shape: tuple[int, int]
@@ -65,6 +66,7 @@ class Header(NamedTuple):
     excluded: int | None = None
     places: Mapping[str, Sequence[PlaceInSet]] = {}
     own: Sequence[PlaceInSet] = ()
+    unknown: Sequence[str] = ()
 
     @property
     def words(self) -> str:

@@ -25,7 +25,8 @@ from mvrecon.data.dicom_image import DicomImage, finite, same
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, storable
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.files.nm import TIME, VIEW, WINDOW, began, frame_numbers
+from mvrecon_spect.files.nm import began, frame_numbers
+from mvrecon_spect.files.nm_keys import TIME, VIEW, WINDOW
 
 #: Share of a voxel that the directions of a file may move it.
 MOVED = 1e-3
