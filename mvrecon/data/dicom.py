@@ -64,9 +64,9 @@ CT_KEYS = (
     Key("Modality", "refused", "series of other objects beside a CT are skipped", ("CT",)),
     Key("SOPClassUID", "applied", "series of captures are skipped"),
     Key(
-        "ImageType, FrameType",
+        "ImageType",
         "compared",
-        "series of localizers are skipped; flat slices in HU: refused with "
+        "series of localizers are skipped; flat slices in HU: refused, as is FrameType, with "
         f"{', '.join(sorted(OTHERWISE))}",
     ),
     Key(

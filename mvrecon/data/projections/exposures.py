@@ -180,10 +180,12 @@ def warn_of_several(path: Path, stated: Mapping[str, Sequence[str]], cure: str =
             several.append(f"{name}, {' or '.join(sorted(words)[:3])}")
             names += [] if kind_of(name) == "beam" else [name]
     if several:
-        ways = "".join(f"{name} or " for name in names)
+        first = {kind_of(name): name for name in reversed(names)}
+        kinds = ("whole", "share") if "whole" in first else ("time", "rate", "share")
+        way = "*".join(first[kind] for kind in kinds if kind in first) or first.get("vague")
         cure = cure or (
-            f"for which their grey values are not corrected but by views.exposure={ways}<file> "
-            f"with exposures relative to the flat field's"
+            f"for which their grey values are not corrected but by views.exposure="
+            f"{f'{way} or ' if way else ''}<file> with exposures relative to the flat field's"
         )
         warnings.warn(
             f"{path}: views have several values of {'; '.join(several)}, {cure}", stacklevel=3

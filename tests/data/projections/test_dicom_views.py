@@ -122,6 +122,26 @@ def test_a_set_has_one_warning_of_places_and_one_of_light(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("names", "way"),
+    [
+        ("ExposureTime XRayTubeCurrent", "ExposureTime*XRayTubeCurrent"),
+        ("ExposureTime XRayTubeCurrent Exposure", "Exposure"),
+        ("KVP ExposureTime", "ExposureTime"),
+        ("AveragePulseWidth", "AveragePulseWidth"),
+    ],
+)
+def test_the_advice_of_a_warning_is_an_option(names, way, tmp_path):
+    """The product of time and current, or the exposure that contains both."""
+
+    def change(dataset, k):
+        for name in names.split():
+            setattr(dataset, name, 100 + 10 * k)
+
+    (text,) = warned(views(tmp_path, change))
+    assert f"views.exposure={way} or <file>" in text
+
+
+@pytest.mark.parametrize(
     ("creator", "group", "element", "kind", "values"),
     [
         ("GEMS_GENIE_1", 0x11, 0x3B, "FD", {1.0: None, 2.0: "Pixel Scale"}),
