@@ -71,7 +71,12 @@ KEYS = (
         "refused",
         "an image, not labels",
     ),
-    Key("BurnedInAnnotation", "refused", "measured pixels, without text in them", ("NO",)),
+    Key(
+        "BurnedInAnnotation",
+        "refused",
+        "measured pixels, without text in them; state NO where there is none",
+        ("NO",),
+    ),
     Key("PlanarConfiguration", "ignored", "of colours"),
     Key(
         "LossyImageCompression, LossyImageCompressionRatio, LossyImageCompressionMethod",
@@ -328,8 +333,9 @@ class DicomImage:
             for _, holders in (*self._image, *self._frames):
                 for group, tag in holders.get("", ()):
                     name = _private_name(group, tag)
-                    value = group[tag].value if has_effect(name, None, EFFECTS) else None
-                    if not _empty(value) and has_effect(name, value, EFFECTS):
+                    value = group[tag].value if has_effect(name, None, EFFECTS) else ()
+                    stated = [] if _empty(value) else np.atleast_1d(value).tolist()
+                    if any(has_effect(name, one, EFFECTS) for one in stated):
                         found.append(f"{name} {shown(value)} of {group[tag].private_creator}")
         return found
 

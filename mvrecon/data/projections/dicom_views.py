@@ -100,7 +100,12 @@ DICOM_KEYS = (
     ),
     Key("LUTFunction", "refused", "grey values in proportion to intensity", ("TO_LOG",)),
     Key("PresentationIntentType", "refused", "not processed for display", ("FOR PROCESSING",)),
-    Key("LogFlag", "refused", "DICOM-CT-PD's, as PixelIntensityRelationship", ("NO",)),
+    Key(
+        "LogFlag",
+        "refused",
+        "DICOM-CT-PD's: convert its logarithms, and say kind=integrals (views.kind)",
+        ("NO",),
+    ),
     Key(
         "ImageProcessingApplied",
         "refused",
@@ -121,8 +126,13 @@ DICOM_KEYS = (
         (0,),
     ),
     Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
-    Key("GeometricalProperties", "refused", "pixels of one size", ("UNIFORM",)),
-    Key("TableMotion", "refused", "an object at rest; the cameras move", ("STATIC",)),
+    Key("GeometricalProperties", "refused", "pixels of one size; rectify the images", ("UNIFORM",)),
+    Key(
+        "TableMotion",
+        "refused",
+        "an object at rest; where the cameras move in its place, state STATIC",
+        ("STATIC",),
+    ),
     Key(
         "DetectorShape",
         "refused",

@@ -146,6 +146,7 @@ def test_the_advice_of_a_warning_is_an_option(names, way, tmp_path):
     [
         ("GEMS_GENIE_1", 0x11, 0x3B, "FD", {1.0: None, 2.0: "Pixel Scale"}),
         ("GEMS_GENIE_1", 0x11, 0x3C, "FD", {0.0: None, 5.0: "Pixel Offset"}),
+        ("GEMS_GENIE_1", 0x11, 0x3B, "FD", {(1.0, 1.0): None, (1.0, 3.0): "Pixel Scale"}),
         ("GEMS_GENIE_1", 0x11, 0x19, "FD", {250.0: None}),
         ("SIEMENS MED NM", 0x33, 0x38, "FL", {1.0: None, 0.5: "Pixel scale factor"}),
         ("SIEMENS SMS-AX  VIEW 1.0", 0x19, 0x0F, "US", {0: None, 1: "Flipped"}),
@@ -165,7 +166,8 @@ def test_private_attributes_that_may_scale_or_turn_pixels(
 
             def change(dataset, _, block=block, value=value):
                 dataset.add_new((group, block), "LO", creator)
-                dataset.add_new((group, block << 8 | element), kind, value)
+                stated = list(value) if isinstance(value, tuple) else value
+                dataset.add_new((group, block << 8 | element), kind, stated)
 
             texts = warned(views(tmp_path, change))
             assert len(texts) == (name is not None)

@@ -43,7 +43,18 @@ KEYS = (
     Key("PixelSpacing", "applied"),
     Key("SpacingBetweenSlices", "applied", "also negative; of a single slice or SliceThickness"),
     Key("MeasurementUnitsCodeSequence, Units", "applied", "one unit"),
-    Key("CorrectedImage, SliceProgressionDirection", "ignored", "neither values nor places"),
+    Key(
+        "CorrectedImage, DecayCorrection, DecayFactor, DoseCalibrationFactor, SUVType, "
+        "SliceProgressionDirection",
+        "ignored",
+        "neither values nor places: the unit has them",
+    ),
+    Key(
+        "SliceThickness, SliceLocation, GantryDetectorTilt, ZoomFactor, TableTraverse, "
+        "PatientPosition, PatientOrientationCodeSequence",
+        "ignored",
+        "position, directions and distance decide",
+    ),
 )
 #: NM Image Storage.
 NM = "1.2.840.10008.5.1.4.1.1.20"
