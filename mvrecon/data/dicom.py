@@ -23,8 +23,22 @@ from mvrecon.geometry.grid import Grid
 #: Codes of Hounsfield units, in lower case.
 HU = ("[hnsf'u]", "hu", "1", "us")
 #: Attributes that slices of one volume have in common, and those on which their values depend.
-ONE_VOLUME = ("StackID", "TemporalPositionIndex", "FrameType", "TemporalPositionIdentifier")
-VALUES_DEPEND = ("KVP", "ConvolutionKernel")
+ONE_VOLUME = (
+    *("StackID", "TemporalPositionIndex", "FrameType", "TemporalPositionIdentifier"),
+    *("NominalPercentageOfCardiacPhase", "NominalPercentageOfRespiratoryPhase"),
+    *("NominalCardiacTriggerDelayTime", "TemporalPositionTimeOffset", "PatientPosition"),
+)
+VALUES_DEPEND = (
+    *("KVP", "ConvolutionKernel", "ReconstructionAlgorithm", "ImageFilter"),
+    *("MultienergyCTAcquisition", "MonoenergeticEnergyEquivalent"),
+)
+#: Words of an ImageType or FrameType whose pixels are no slices of Hounsfield units: projections,
+#: differences, statistics, and materials (PS3.3, C.8.2.1.1.1 and C.8.16.1.4).
+OTHERWISE = {
+    *("LOCALIZER", "MAXIMUM", "MINIMUM", "MIP", "MINIP", "ADDITION", "SUBTRACTION", "DIVISION"),
+    *("MULTIPLICATION", "STD_DEVIATION", "QUANTITY", "MAT_SPECIFIC", "MAT_FRACTIONAL"),
+    *("MAT_VALUE_BASED", "EFF_ATOMIC_NUM", "ELECTRON_DENSITY"),
+}
 #: Attributes of a CT series besides `dicom_image.KEYS`.
 CT_KEYS = (
     Key("RescaleType", "refused", "values of a CT are in HU", ("HU", "US")),
@@ -48,9 +62,19 @@ CT_KEYS = (
         ("NONE", "MPR"),
     ),
     Key("Modality", "refused", "series of other objects beside a CT are skipped", ("CT",)),
-    Key("SOPClassUID, ImageType", "applied", "series of captures or localizers are skipped"),
+    Key("SOPClassUID", "applied", "series of captures are skipped"),
     Key(
-        "SliceThickness, SpacingBetweenSlices, SliceLocation, GantryDetectorTilt, PatientPosition",
+        "ImageType",
+        "compared",
+        "series of localizers are skipped; flat slices in HU: refused, as is FrameType, with "
+        f"{', '.join(sorted(OTHERWISE))}",
+    ),
+    Key(
+        "SliceThickness, SpacingBetweenSlices, SliceLocation, GantryDetectorTilt, "
+        "GantryDetectorSlew, TableHeight, TablePosition, ReconstructionDiameter, "
+        "ReconstructionTargetCenterPatient, ReconstructionPixelSpacing, "
+        "DataCollectionCenterPatient, ImageToEquipmentMappingMatrix, ImagePosition, "
+        "ImageOrientation, DimensionIndexValues, InStackPositionNumber",
         "ignored",
         "positions, of the patient, decide",
     ),
@@ -261,6 +285,8 @@ def _slices(path: Path) -> list[Slice]:
             f"groups, got an image of several frames: {image.frames} with {image.groups} groups"
         )
     image.check(CT_KEYS)
+    words = {"ImageType": OTHERWISE, "FrameType": OTHERWISE}
+    image.check_words(words, "flat slices of Hounsfield units")
     stated: list[Any] = [image.value(name) for name in ONE_VOLUME]
     for name in VALUES_DEPEND:
         stated.append(", ".join(sorted({str(value) for _, value in image.stated(name)})))

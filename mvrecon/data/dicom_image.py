@@ -6,14 +6,15 @@ each frame in its own (PS3.3, C.7.6.16), there within a sequence of any depth.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, file_errors, io_library, shown
-from mvrecon.core.files.keys import Key, check_keys
+from mvrecon.core.files.keys import Key, check_keys, has_effect
 
 #: Endings of DICOM files; others are recognised by the bytes from 128 on, or, without these, by a
 #: short element of the group 2 or 8 at their beginning: with a type of two letters, or a length.
@@ -51,7 +52,12 @@ KEYS = (
         "pixel has it",
     ),
     Key("PixelPaddingRangeLimit", "applied", "other end of the padding's range"),
-    Key("FloatPixelPaddingValue, DoubleFloatPixelPaddingValue", "applied", "as PixelPaddingValue"),
+    Key(
+        "FloatPixelPaddingValue, FloatPixelPaddingRangeLimit, DoubleFloatPixelPaddingValue, "
+        "DoubleFloatPixelPaddingRangeLimit",
+        "applied",
+        "as PixelPaddingValue",
+    ),
     Key("PixelAspectRatio", "compared", "with the pixel size; without one refused unless 1"),
     Key(
         "PhotometricInterpretation",
@@ -59,11 +65,36 @@ KEYS = (
         "one grey value per pixel; MONOCHROME1 affects display alone",
         ("MONOCHROME1", "MONOCHROME2"),
     ),
-    Key("SamplesPerPixel", "refused", "one grey value per pixel", (1,)),
+    Key("SamplesPerPixel, Planes", "refused", "one grey value per pixel", (1,)),
+    Key(
+        "SegmentationType, SegmentationFractionalType, MaximumFractionalValue",
+        "refused",
+        "an image, not labels",
+    ),
+    Key(
+        "BurnedInAnnotation",
+        "refused",
+        "measured pixels, without text in them; state NO where there is none",
+        ("NO",),
+    ),
     Key("PlanarConfiguration", "ignored", "of colours"),
-    Key("LossyImageCompression", "ignored", "values are those that are decoded"),
-    Key("WindowCenter, VOILUTSequence, PresentationLUTShape", "ignored", "display alone"),
-    Key("MaskSubtractionSequence, FramePixelShiftSequence", "ignored", "display alone"),
+    Key(
+        "LossyImageCompression, LossyImageCompressionRatio, LossyImageCompressionMethod",
+        "ignored",
+        "values are those that are decoded",
+    ),
+    Key(
+        "WindowCenter, WindowWidth, VOILUTFunction, VOILUTSequence, PresentationLUTShape, "
+        "PixelPresentation, OverlayData, ShutterShape, FrameDisplayShutterSequence, "
+        "MaskSubtractionSequence, FramePixelShiftSequence",
+        "ignored",
+        "display alone",
+    ),
+    Key(
+        "SmallestImagePixelValue, LargestImagePixelValue, QualityControlImage",
+        "ignored",
+        "statistics and purpose",
+    ),
 )
 #: Attributes of a part of a multi-frame image that is stored in several files, and the refusal of
 #: one where they are not joined.
@@ -77,14 +108,56 @@ MACROS = {
     for name in (
         "PixelMeasures PlanePosition PlaneOrientation PixelValueTransformation FieldOfView "
         "RealWorldValueMapping FramePixelDataProperties FrameDetectorParameters FrameContent "
-        "PixelIntensityRelationshipLUT Exposure XRayFilter"
+        "PixelIntensityRelationshipLUT Exposure XRayFilter XRayGrid XRayAcquisitionDose "
+        "XRayGeometry IsocenterReferenceSystem PositionerPosition DetectorPosition TablePosition "
+        "FrameAcquisition XAXRFFrameCharacteristics PerProjectionAcquisition "
+        "CTImageFrameType XRay3DFrameType CTExposure CTXRayDetails CTReconstruction CTGeometry "
+        "CTPosition CardiacSynchronization RespiratorySynchronization TemporalPosition "
+        "MultienergyCTProcessing MultienergyCTCharacteristics"
     ).split()
 }
-#: Private attributes of projections in DICOM-CT-PD (Chen and others, Med. Phys. 42, 2015).
+#: Private attributes of projections in DICOM-CT-PD (Chen and others, Med. Phys. 42, 2015; user
+#: manual of 2020) by tag in the first block of its group, and the type of their numbers, "" of
+#: text: pydicom reads those of an unknown type as bytes.
 PRIVATE = {
-    0x7029100B: "DetectorShape",
-    0x70291010: "NumberofDetectorRows",
-    0x70291011: "NumberofDetectorColumns",
+    0x70291002: ("DetectorElementTransverseSpacing", "<f4"),
+    0x70291006: ("DetectorElementAxialSpacing", "<f4"),
+    0x7029100B: ("DetectorShape", ""),
+    0x70291010: ("NumberofDetectorRows", "<u2"),
+    0x70291011: ("NumberofDetectorColumns", "<u2"),
+    0x70311001: ("DetectorFocalCenterAngularPosition", "<f4"),
+    0x70311002: ("DetectorFocalCenterAxialPosition", "<f4"),
+    0x70311003: ("DetectorFocalCenterRadialDistance", "<f4"),
+    0x70311031: ("ConstantRadialDistance", "<f4"),
+    0x70311033: ("DetectorCentralElement", "<f4"),
+    0x7033100B: ("SourceAngularPositionShift", "<f4"),
+    0x7033100C: ("SourceAxialPositionShift", "<f4"),
+    0x7033100D: ("SourceRadialDistanceShift", "<f4"),
+    0x7033100E: ("FlyingFocalSpotMode", ""),
+    0x70331013: ("NumberofSourceAngularSteps", "<u2"),
+    0x7033105D: ("SourceIndex", "<u2"),
+    0x70331061: ("NumberofSpectra", "<u2"),
+    0x70331063: ("SpectrumIndex", "<u2"),
+    0x70331065: ("PhotonStatistics", "<f4"),
+    0x70331067: ("Timestamp", "<f4"),
+    0x70371009: ("TypeofProjectionData", ""),
+    0x7037100A: ("TypeofProjectionGeometry", ""),
+    0x70391003: ("BeamHardeningCorrectionFlag", ""),
+    0x70391004: ("GainCorrectionFlag", ""),
+    0x70391005: ("DarkFieldCorrectionFlag", ""),
+    0x70391006: ("FlatFieldCorrectionFlag", ""),
+    0x70391007: ("BadPixelCorrectionFlag", ""),
+    0x70391008: ("ScatterCorrectionFlag", ""),
+    0x70391009: ("LogFlag", ""),
+    0x70411001: ("WaterAttenuationCoefficient", ""),
+}
+#: Words in the names of other private attributes, as pydicom knows them, which scale, correct or
+#: turn the pixels, and the value that does not.
+EFFECTS = {
+    r"pixel scal(e|ing)|rescale slope|fscalar|(scal(e|ing)|dose calibration|decay) factor\b": 1,
+    r"pixel offset|rescale intercept": 0,
+    r"(image|pet) flip|image rotation(?! angle)|flipped|flip flag|mirror": 0,
+    r"(decay|scatter|attenuation)\b.* flag": 0,
 }
 #: Sequences of functional groups that describe other images.
 OTHERS = re.compile("Referenced|Source|Derivation|Contributing|Original|ConversionSource")
@@ -185,7 +258,7 @@ class DicomImage:
         found = []
         with file_errors(self.path, f"has a {name} that cannot be read"):
             for place, holders in (*self._image, *own):
-                found += [(place, group[tag].value) for group, tag in holders.get(name, ())]
+                found += [(place, _value(group[tag])) for group, tag in holders.get(name, ())]
         return [(place, value) for place, value in found if not _empty(value)]
 
     def values(self, name: str) -> list[Any]:
@@ -231,19 +304,51 @@ class DicomImage:
     def check(self, keys: Sequence[Key]) -> None:
         """Raise if a key to refuse is stated anywhere in the file with a value not allowed."""
         for key in keys:
-            for place, value in self.stated(key.name) if key.use == "refused" else []:
-                where = f"{self.path}{'' if place == 'the image' else f', {place}'}"
-                check_keys(where, [key], {key.name: value}.get)
+            for name in key.names if key.use == "refused" else []:
+                for place, value in self.stated(name):
+                    where = f"{self.path}{'' if place == 'the image' else f', {place}'}"
+                    check_keys(where, [key._replace(name=name)], {name: value}.get)
+
+    def check_words(self, refused: Mapping[str, Collection[str]], expected: str) -> None:
+        """Raise if an attribute contains one of its words to refuse anywhere in the file.
+
+        Args:
+            refused: words in capitals by the name of the attribute.
+            expected: what is expected, for the message.
+        """
+        for name, words in refused.items():
+            for _, value in self.stated(name):
+                found = " ".join(map(str, np.atleast_1d(value))).upper().split()
+                if wrong := sorted({*found} & {*words}):
+                    raise Refused(
+                        f"{self.path}: expected {expected}, got {name} with {', '.join(wrong)}"
+                    )
+
+    def private(self) -> list[str]:
+        """Private attributes with a name of pydicom's dictionary by which they may change the
+        pixels (`EFFECTS`), with their creators and values.
+        """
+        found = []
+        with file_errors(self.path, "has private attributes that cannot be read"):
+            for _, holders in (*self._image, *self._frames):
+                for group, tag in holders.get("", ()):
+                    name = _private_name(group, tag)
+                    value = group[tag].value if has_effect(name, None, EFFECTS) else ()
+                    stated = [] if _empty(value) else np.atleast_1d(value).tolist()
+                    if any(has_effect(name, one, EFFECTS) for one in stated):
+                        found.append(f"{name} {shown(value)} of {group[tag].private_creator}")
+        return found
 
     def pixel_mm(self, *names: str) -> tuple[float, float] | None:
         """Size of a pixel (v, u) in mm by the first of some attributes that the file has; None if
-        it has none.
+        it has none. A name such as "A, B" is of two attributes, for v and u.
 
         Raises:
             Refused: several that differ, sizes that are no positive numbers, or a PixelAspectRatio
                 that contradicts them.
         """
-        sizes = [(name, value) for name in names if (value := self.value(name)) is not None]
+        stated = [(name, [self.value(part) for part in name.split(", ")]) for name in names]
+        sizes = [(k, v[0] if len(v) == 1 else v) for k, v in stated if None not in v]
         ratio = self.value("PixelAspectRatio")
         pitches = [finite(self.path, name, value, 2) for name, value in sizes]
         for (name, _), pitch in zip(sizes, pitches, strict=True):
@@ -261,6 +366,12 @@ class DicomImage:
                     f"pixel size has, got {down:g} to {along:g}; state {' or '.join(names)} in mm"
                 )
         return (float(pitches[0][0]), float(pitches[0][1])) if pitches else None
+
+    def anywhere(self, name: str) -> list[Any]:
+        """The values of an attribute that are not empty, in sequences of the image of any depth."""
+        with file_errors(self.path, f"has a {name} that cannot be read"):
+            held = _holders(self.dataset, {}).get(name, ())
+            return [v for group, tag in held if not _empty(v := group[tag].value)]
 
     def units(self) -> set[str]:
         """Units that the values have by Units or by real world value mappings; empty if unknown."""
@@ -315,13 +426,38 @@ def _holders(
     from pydicom.datadict import keyword_for_tag
 
     for tag in list(group.keys()):
-        name = PRIVATE.get(tag) or keyword_for_tag(tag)  # "" of other private attributes
+        name = _of_ct_pd(tag)[0] or keyword_for_tag(tag)  # "" of other private attributes
         held.setdefault(name, []).append((group, tag))
         enter = inside(name) if inside else not OTHERS.match(name)
         if name.endswith("Sequence") and enter:
             for item in group[tag].value or []:
                 _holders(item, held)
     return held
+
+
+def _of_ct_pd(tag: Any) -> tuple[str, str]:
+    """The name and type of a private attribute in `PRIVATE`, whatever the number of its block."""
+    block = tag.element >> 8  # 0 of the names of creators
+    return PRIVATE.get(tag & 0xFFFF00FF | 0x1000 if block else tag, ("", ""))
+
+
+def _private_name(group: Any, tag: Any) -> str:
+    """The name of a private attribute in pydicom's dictionary, by its creator; "" of others."""
+    from pydicom.datadict import private_dictionary_description
+
+    creator = group.get((tag.group, tag.element >> 8))
+    with suppress(KeyError, AttributeError):
+        return private_dictionary_description(tag, str(creator.value))
+    return ""
+
+
+def _value(element: Any) -> Any:
+    """The value of an attribute, decoded if it is one of `PRIVATE` of an unknown type."""
+    value, (name, kind) = element.value, _of_ct_pd(element.tag)
+    if not name or not isinstance(value, bytes):
+        return value
+    numbers = np.frombuffer(value, kind).tolist() if kind else [value.decode("ascii").strip(" \0")]
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def _empty(value: Any) -> bool:

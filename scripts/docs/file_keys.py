@@ -12,9 +12,9 @@ from pathlib import Path
 
 from mvrecon.core.files.keys import Key
 from mvrecon.data import dicom, dicom_image, itk_headers, nifti, vgi
-from mvrecon.data.projections import images, nexus, png, rtk_images, tiff
+from mvrecon.data.projections import dicom_views, nexus, png, rtk_images, tiff
 from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
-from mvrecon_spect.files import interfile_keys, nm, nm_volume
+from mvrecon_spect.files import interfile_keys, nm_keys, nm_volume
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "file_formats.md"
 TABLE = re.compile(
@@ -27,8 +27,8 @@ FORMATS: dict[str, Sequence[Key]] = {
     "VGStudio's .vgi": vgi.KEYS,
     "DICOM": dicom_image.KEYS,
     "DICOM CT": dicom.CT_KEYS,
-    "DICOM projections": images.DICOM_KEYS,
-    "DICOM NM (plugin `mvrecon-spect`)": nm.KEYS,
+    "DICOM projections": dicom_views.DICOM_KEYS,
+    "DICOM NM (plugin `mvrecon-spect`)": nm_keys.KEYS,
     "DICOM NM volumes": nm_volume.KEYS,
     "TIFF": tiff.TIFF_KEYS,
     "PNG": png.PNG_KEYS,

@@ -5,7 +5,7 @@ by name.
 import math
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -160,33 +160,35 @@ def _values_of(texts: Iterable[str]) -> set[str]:
     return {word for text in texts for word in text.split(" or ")} - {""}
 
 
-def warn_of_several(path: Path, name: str, texts: Sequence[str], cure: str = "") -> None:
-    """Warn of views that state several values of an attribute, but for numbers that differ by no
-    more than counts.
+def warn_of_several(path: Path, stated: Mapping[str, Sequence[str]], cure: str = "") -> None:
+    """Warn, once, of views that state several values of an attribute, but for numbers that differ
+    by no more than counts.
 
     Args:
         path: path of the views.
-        name: name of the attribute.
-        texts: text of each view; "" of none, several joined by " or ".
+        stated: text of each view by the name of the attribute; "" of none, several joined by
+            " or ".
         cure: advice that ends the warning; "": that for exposure and beam.
     """
-    stated = _values_of(texts)
-    own = "" if kind_of(name) == "beam" else f"{name} or "
-    default = not cure  # others are places, of which every difference counts
-    cure = cure or (
-        f"for which their grey values are not corrected but by views.exposure={own}<file> with "
-        f"exposures relative to the flat field's"
-    )
-    if len(stated) < 2:
-        return
-    within = _counting(name) if default else 0.0
-    numbers = _numbers(stated)
-    apart = (np.ptp(x, axis=0) > within * np.abs(x).max(axis=0) for x in numbers.values())
-    if len(numbers) > 1 or any(differ.any() for differ in apart):
+    several, names = [], []
+    for name, texts in stated.items():
+        words = _values_of(texts)
+        within = 0.0 if cure else _counting(name)  # others are places: every difference counts
+        numbers = _numbers(words)
+        apart = (np.ptp(x, axis=0) > within * np.abs(x).max(axis=0) for x in numbers.values())
+        if len(numbers) > 1 or any(differ.any() for differ in apart):
+            several.append(f"{name}, {' or '.join(sorted(words)[:3])}")
+            names += [] if kind_of(name) == "beam" else [name]
+    if several:
+        first = {kind_of(name): name for name in reversed(names)}
+        kinds = ("whole", "share") if "whole" in first else ("time", "rate", "share")
+        way = "*".join(first[kind] for kind in kinds if kind in first) or first.get("vague")
+        cure = cure or (
+            f"for which their grey values are not corrected but by views.exposure="
+            f"{f'{way} or ' if way else ''}<file> with exposures relative to the flat field's"
+        )
         warnings.warn(
-            f"{path}: views have several values of {name}, {' or '.join(sorted(stated)[:3])}, "
-            f"{cure}",
-            stacklevel=3,
+            f"{path}: views have several values of {'; '.join(several)}, {cure}", stacklevel=3
         )
 
 

@@ -1,6 +1,7 @@
 """Projections as images: a folder of TIFF, PNG, DICOM or RTK's files, or one file of several pages.
 
-For TIFF see `mvrecon.data.projections.tiff`, for PNG `png`, for RTK's formats `rtk_images`.
+For TIFF see `mvrecon.data.projections.tiff`, for PNG `png`, for DICOM `dicom_views`, for RTK's
+formats `rtk_images`.
 """
 
 import re
@@ -14,11 +15,16 @@ from pathlib import Path
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file, check_link, file_errors, shown
-from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import DICOM, ONE_FILE, DicomImage, dicom_file, same
-from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
+from mvrecon.data.dicom_image import DICOM, DicomImage, dicom_file, same
 from mvrecon.data.projections import exposures, rtk_images
 from mvrecon.data.projections.descriptions import path_in_set
+from mvrecon.data.projections.dicom_views import (
+    ALIKE,
+    CAMERA_PLACES,
+    COMPARED,
+    dicom_header,
+    dicom_pages,
+)
 from mvrecon.data.projections.ordering import check_steps, ordered
 from mvrecon.data.projections.png import png_header, png_pages
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet, ProjectionStack
@@ -28,93 +34,6 @@ from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", **rtk_images.ENDINGS}
 #: Files below a folder without images that are looked at, to name the folder that has some.
 LOOKED_AT = 1000
-#: Attributes of DICOM projections that all views have in common.
-ALIKE = (
-    "FieldOfViewOrigin",
-    "PixelDataAreaOriginRelativeToFOV",
-    "FieldOfViewDimensions",
-    "FieldOfViewDimensionsInFloat",
-    "DetectorBinning",
-    "RTImageOrientation",
-    "RTImagePosition",
-    "XRayImageReceptorTranslation",
-    "XRayImageReceptorAngle",
-    "DetectorActiveOrigin",
-)
-#: Attributes of DICOM projections that change grey values, but not in proportion.
-BEAM = (
-    *("KVP", "AnodeTargetMaterial", "HalfValueLayer", "XRayOutput", "RadiationMode"),
-    *("RadiationSetting", "ExposureStatus", "Sensitivity", "DetectorMode"),
-    *("FilterMaterial", "FilterType", "TypeOfFilters"),
-    *("FilterThicknessMinimum", "FilterThicknessMaximum"),
-    *("FilterBeamPathLengthMinimum", "FilterBeamPathLengthMaximum"),
-    *("Grid", "GridID", "GridAbsorbingMaterial", "GridSpacingMaterial", "GridThickness"),
-    *("GridPitch", "GridPeriod", "GridAspectRatio", "GridFocalDistance"),
-)
-#: Attributes of DICOM projections that say where a camera is.
-CAMERA_PLACES = (
-    "DistanceSourceToDetector",
-    "DistanceSourceToPatient",
-    "RTImageSID",
-    "RadiationMachineSAD",
-)
-#: Rows and columns of the detector in DICOM-CT-PD.
-PIXELS = ("NumberofDetectorRows", "NumberofDetectorColumns")
-#: All that are compared between views with a warning.
-COMPARED = (*exposures.DICOM, *BEAM, *CAMERA_PLACES)
-#: Attributes of DICOM projections besides `dicom_image.KEYS`.
-DICOM_KEYS = (
-    Key(
-        "PixelIntensityRelationship",
-        "refused",
-        "grey values in proportion to intensity; convert the images, and say kind=integrals "
-        "(views.kind)",
-        ("LIN",),
-    ),
-    Key(
-        "PixelIntensityRelationshipSign",
-        "refused",
-        "grey values that rise with intensity; invert those that fall",
-        (1,),
-    ),
-    Key("LUTFunction", "refused", "grey values in proportion to intensity", ("TO_LOG",)),
-    Key("PresentationIntentType", "refused", "not processed for display", ("FOR PROCESSING",)),
-    Key("RescaleType", "refused", "grey values; convert those of another unit", ("US",)),
-    Key("FieldOfViewRotation", "refused", "pixels in the detector's order", (0,)),
-    Key("FieldOfViewHorizontalFlip", "refused", "pixels in the detector's order", ("NO",)),
-    Key("PixelDataAreaRotationAngleRelativeToFOV", "refused", "as FieldOfViewRotation", (0,)),
-    Key(
-        "DetectorShape",
-        "refused",
-        "DICOM-CT-PD's: cameras are flat; convert the views to those of a flat detector",
-        ("FLAT",),
-    ),
-    Key(", ".join(PIXELS), "compared", "DICOM-CT-PD's, with Rows and Columns"),
-    *ONE_FILE,
-    Key("AppliedMaskSubtractionFlag", "refused", "grey values, not differences", ("NO",)),
-    Key("ImagerPixelSpacing", "compared", "with the cameras' pixel size"),
-    Key("NominalScannedPixelSpacing", "compared", "as ImagerPixelSpacing, and with it"),
-    *(Key(name, "compared", "one of all views") for name in ALIKE),
-    Key(
-        ", ".join(exposures.DICOM),
-        "compared",
-        "of views and flat fields; warned of, applied by views.exposure, where others must agree",
-    ),
-    Key(", ".join(BEAM), "compared", "of views and flat fields; warned of"),
-    Key("ExposureIndex, DeviationIndex", "ignored", "of the grey values, also of the object"),
-    Key("ImageAndFluoroscopyAreaDoseProduct", "ignored", "may be a sum over images"),
-    Key("InstanceNumber", "applied", "order of the views in files of their own"),
-    Key("FrameAcquisitionNumber", "compared", "with the order of the frames"),
-    Key("PixelSpacing, ImagePlanePixelSpacing", "ignored", "may be that of the object"),
-    Key("DetectorElementSpacing", "ignored", "ImagerPixelSpacing is that of binned pixels"),
-    Key(", ".join(CAMERA_PLACES), "compared", "of all views; warned of, as the camera decides"),
-    Key(
-        "PositionerPrimaryAngle, PositionerSecondaryAngle, "
-        "EstimatedRadiographicMagnificationFactor, ImagePositionPatient, PatientPosition",
-        "ignored",
-        "the camera decides",
-    ),
-)
 #: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001; the
 #: ESRF has refHST0000.edf, dark.edf, and darkend0000.edf, a sum of images, which is no field.
 FIELDS = {
@@ -169,12 +88,14 @@ class ImageFiles(ProjectionStack):
         for name in dict.fromkeys((*COMPARED, *(key for head in headers for key in head.stated))):
             own = [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
             self.stated[name] = [own[k] for k in order]
-        for name, texts in self.stated.items():
-            cure = "which the camera must have" if name in CAMERA_PLACES else ""
-            exposures.warn_of_several(files[0].parent, name, texts, cure)
+        folder = files[0].parent
+        places = {name: self.stated[name] for name in CAMERA_PLACES}
+        light = {name: texts for name, texts in self.stated.items() if name not in places}
+        exposures.warn_of_several(folder, light)
+        exposures.warn_of_several(folder, places, "which the camera must have")
         self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm = headers[0].pixel_mm
-        self.unknown = [name for head in headers for name in head.unknown]
+        self.unknown = sorted({name for head in headers for name in head.unknown})
         self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,
@@ -389,65 +310,12 @@ def header(file: Path) -> Header:
     """
     check_file(file, "an image (TIFF, PNG, DICOM or a format of RTK)")
     with file_errors(file, "cannot be read as an image"):
-        return HEADERS.get(_ending(file), _dicom_header)(file)
+        return HEADERS.get(_ending(file), dicom_header)(file)
 
 
 def _pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
     with file_errors(file, f"pages {first} to {last - 1} cannot be read"):
-        yield from PAGES.get(_ending(file), _dicom_pages)(file, first, last)
-
-
-def _dicom_header(file: Path) -> Header:
-    """Integers if values are stored numbers; else floats, whose largest value is that of the
-    stored bits, scaled.
-    """
-    image = DicomImage(file)
-    if image.value("Modality") == "NM" and image.frames > 1:
-        raise Refused(
-            f"{file}: expected projections in the order of the file, got frames of NM, which is to "
-            f"be sorted by its vectors; the plugin mvrecon-spect reads such a file (views.path)"
-        )
-    image.check(DICOM_KEYS)
-    numbers = [int(n) for n in image.values("FrameAcquisitionNumber") if n is not None]
-    if len({*numbers}) > 1 and numbers != sorted(numbers):
-        raise Refused(
-            f"{file}: expected frames in the order of their FrameAcquisitionNumber, got "
-            f"{shown(numbers)}; sort the frames"
-        )
-    for name, size in zip(PIXELS, image.shape, strict=True):
-        if (stated := image.value(name)) is not None and int(stated) != size:
-            raise Refused(
-                f"{file}: expected images with as many rows and columns, {image.shape}, as the "
-                f"detector of DICOM-CT-PD, got {name} {stated}; transpose the images"
-            )
-    (kind, ends), scales = stored_type(image), {scale[:2] for scale in scales_of(image)}
-    tops = {max(slope * end + d for end in ends) if ends else None for slope, d in scales}
-    return Header(
-        image.shape,
-        kind if scales == {(1.0, 0.0)} else np.dtype("f4"),
-        image.frames,
-        frozenset(tops),
-        image.pixel_mm("ImagerPixelSpacing", "NominalScannedPixelSpacing"),
-        tuple(map(image.value, ALIKE)),
-        {name: _texts(image, name) for name in COMPARED},
-        image.value("PixelIntensityRelationship") == "LIN",
-    )
-
-
-def _texts(image: DicomImage, name: str) -> list[str]:
-    """An attribute of each frame of an image as text; "" where it is not stated."""
-    single = image.groups and image.stated(name)
-    found = (
-        {str(value) for _, value in image.stated(name, k)}
-        for k in range(image.frames if single else 1)
-    )
-    texts = [" or ".join(sorted(values)) for values in found]
-    return texts if single else texts * image.frames
-
-
-def _dicom_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:
-    values = pixels_of(file)
-    yield from values.reshape(-1, *values.shape[-2:])[first:last]
+        yield from PAGES.get(_ending(file), dicom_pages)(file, first, last)
 
 
 RTK = rtk_images.ENDINGS.values()

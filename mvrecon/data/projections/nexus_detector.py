@@ -74,7 +74,7 @@ def of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarra
             )
         stated[views if len(texts) == views.sum() else slice(None)] = texts
     if exposures.kind_of(name) == "beam":
-        exposures.warn_of_several(place.path, name, stated[views])
+        exposures.warn_of_several(place.path, {name: stated[views]})
         return stated
     own, flats = (np.array([float(t) for t in stated[w] if t]) for w in (views, keys == FLAT))
     changes = len(own) and np.ptp(own) > exposures.MAX_CHANGE * abs(own.mean())

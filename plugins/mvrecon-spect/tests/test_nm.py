@@ -1,5 +1,6 @@
 """DICOM NM: frames in any order are sorted by window, detector, rotation and angular view."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -257,7 +258,8 @@ def test_padding_of_zero_counts_is_accepted(
 
 def test_uniformity_correction_is_accepted(tmp_path: Path, nm: NmStudy):
     neutral = {"ScatterFractionFactor": 0.0, "DecayFactor": 1.0, "DeadTimeCorrected": "NO"}
-    again = read_nm(study(tmp_path / "a.dcm", CorrectedImage=["UNIF", "COR", "LIN"], **neutral))
+    corrected = ["UNIF", "COR", "NRGY", "LIN", "MOTN"]
+    again = read_nm(study(tmp_path / "a.dcm", CorrectedImage=corrected, **neutral))
     assert all(map(torch.equal, again.counts, nm.counts))
 
 
@@ -286,6 +288,83 @@ def heads(**values: object) -> dict:
     return {"DetectorInformationSequence": items}
 
 
+def several(name: str, *values: float) -> dict:
+    """An attribute of two detectors, of two rotations, or of the time slots of gated frames."""
+    from pydicom.dataset import Dataset
+
+    if name == "ZoomFactor":
+        items = heads()["DetectorInformationSequence"]
+    elif name == "TimeSlotTime":
+        items = [Dataset() for _ in values]
+    else:
+        items = [turn(StartAngle=None)["RotationInformationSequence"][0] for _ in values]
+    for one, value in zip(items, values, strict=True):
+        setattr(one, name, value)
+    if name == "ZoomFactor":
+        return {"DetectorInformationSequence": items}
+    if name != "TimeSlotTime":
+        return {"RotationInformationSequence": items, "RotationVector": [1] * 12}
+    intervals = [item(Dataset, FrameTime=50.0, TimeSlotInformationSequence=items)] * 2
+    return {"GatedInformationSequence": [item(Dataset, DataInformationSequence=intervals)]}
+
+
+def test_detectors_of_several_zooms_are_refused(tmp_path: Path, nm: NmStudy):
+    """The file has one pixel size."""
+    zoomed = study(tmp_path / "a.dcm", **several("ZoomFactor", [1.45, 1.45], [1.45, 1.45]))
+    assert read_nm(zoomed).views == nm.views
+    with pytest.raises(ValueError, match="ZoomFactor of all detectors"):
+        read_nm(study(tmp_path / "a.dcm", **several("ZoomFactor", [1.0, 1.0], [1.45, 1.45])))
+
+
+@pytest.mark.parametrize("name", ["TableTraverse", "TableHeight", "TimeSlotTime"])
+@pytest.mark.parametrize("last", [400.0, 0.5])
+def test_what_changes_within_a_study_is_warned_of_once(tmp_path: Path, name: str, last: float):
+    """A table that moves between rotations, which a rig may have, and time slots of several
+    durations; one value is read without a warning.
+    """
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        list(read_frames(study(tmp_path / "a.dcm", **several(name, 400.0, last))))
+    texts = [str(one.message) for one in caught]
+    assert len(texts) == (last != 400.0) and all(name in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("creator", "group", "element", "kind", "values"),
+    [
+        ("SIEMENS MED NM", 0x33, 0x38, "FL", {1.0: None, 0.5: "Pixel scale factor"}),
+        ("SIEMENS MED NM", 0x55, 0x56, "SS", {0: None, 1: "Decay Corr"}),
+        ("SIEMENS MED NM", 0x57, 0x07, "FL", {1.0: None, 2.0: "Rescale Slope"}),
+        ("SIEMENS MED NM", 0x55, 0x72, "SS", {3: None}),  # gains in x
+        ("GEMS_GENIE_1", 0x13, 0x15, "FD", {1.0: None, 0.01: "Fscalar"}),
+        ("GEMS_GENIE_1", 0x11, 0x1C, "FL", {126.0: None}),  # offset of the energy
+        ("PHILIPS NM -Private", 0x7051, 0x04, "FL", {1.5: None}),  # centre of rotation
+    ],
+)
+@pytest.mark.parametrize("implicit", [False, True])
+def test_private_attributes_that_may_scale_counts_are_warned_of(
+    tmp_path: Path, creator: str, group: int, element: int, kind: str, values: dict, implicit: bool
+):
+    """By name and creator, in one warning for a study; those of the rig, which the cameras state,
+    and values that change nothing are not.
+    """
+    import pydicom
+
+    for value, name in values.items():
+        path = study(tmp_path / "a.dcm")
+        dataset = pydicom.dcmread(path)
+        dataset.private_block(group, creator, create=True).add_new(element, kind, value)
+        if implicit:
+            dataset.file_meta.TransferSyntaxUID = pydicom.uid.ImplicitVRLittleEndian
+        dataset.save_as(path, implicit_vr=implicit, little_endian=True)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_nm(path)
+        texts = [str(one.message) for one in caught]
+        assert len(texts) == (name is not None)
+        assert all(name in text and creator in text for text in texts)
+
+
 def shared(**values: object) -> dict:
     from pydicom.dataset import Dataset
 
@@ -309,12 +388,23 @@ CONTRADICTIONS = {
         ({"RandomsCorrected": "YES"}, "RandomsCorrected"),
         (shared(ScatterFractionFactor=0.3), "ScatterFractionFactor"),
         ({"CorrectedImage": ["UNIF", "DCAL"]}, "CorrectedImage with DCAL"),
+        ({"CorrectedImage": ["UNIF", "DTIM"]}, "CorrectedImage with DTIM"),
+        ({"CorrectedImage": "CLN"}, "CorrectedImage with CLN"),
+        ({"DecayCorrection": "ADMIN"}, "DecayCorrection"),
+        ({"DecayCorrectionDateTime": "20260101"}, "DecayCorrectionDateTime"),
+        ({"CountLossNormalizationCorrected": "YES"}, "CountLossNormalizationCorrected"),
+        ({"SensitivityCalibrated": "YES"}, "SensitivityCalibrated"),
         (shared(CorrectedImage=["ATTN"]), "CorrectedImage"),
     ],
     "another kind of values": [
         ({"CountsSource": "TRANSMISSION"}, "CountsSource"),
         ({"ImageType": ["ORIGINAL", "PRIMARY", "TOMO", "TRANSMISSION"]}, "ImageType"),
         ({"ImageType": ["DERIVED", "PRIMARY", "RECON GATED TOMO", "EMISSION"]}, "ImageType"),
+        ({"ImageType": ["ORIGINAL", "PRIMARY", "WHOLE BODY", "EMISSION"]}, "ImageType"),
+        ({"ScanVelocity": 2.0}, "ScanVelocity"),
+        ({"SUVType": "BW"}, "SUVType"),
+        ({"ReconstructionMethod": "OSEM"}, "ReconstructionMethod"),
+        ({"BurnedInAnnotation": "YES"}, "BurnedInAnnotation"),
         ({"RescaleType": "HU"}, "RescaleType"),
         (shared(Units="BQML"), "Units"),
         ({"ConcatenationUID": "1.2.3"}, "ConcatenationUID"),

@@ -9,9 +9,14 @@ from PIL import Image as Pillow
 from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian
 
+from mvrecon.data.dicom_image import PRIVATE
 from mvrecon.data.projections.views import Measured, MeasuredViews
 
 VIEWS, ROWS, COLUMNS = 12, 6, 8
+#: Tag and type of DICOM-CT-PD's private attributes.
+CT_PD = {
+    name: (tag, {"": "CS", "<f4": "FL", "<u2": "US"}[kind]) for tag, (name, kind) in PRIVATE.items()
+}
 
 
 def grey():
@@ -38,7 +43,10 @@ def dicom_image(path, values, **tags):
     dataset.SOPInstanceUID = meta.MediaStorageSOPInstanceUID
     dataset.PixelData = values.tobytes()
     for name, value in tags.items():
-        setattr(dataset, name, value)
+        if name in CT_PD:
+            dataset.add_new(*CT_PD[name], value)
+        else:
+            setattr(dataset, name, value)
     dataset.save_as(path, enforce_file_format=True)
 
 

@@ -10,9 +10,9 @@ import torch
 from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data.dicom_image import KEYS, PRIVATE
+from mvrecon.data.dicom_image import KEYS
 from mvrecon.data.dicom_pixels import pixels_of
-from mvrecon.data.projections.images import DICOM_KEYS
+from mvrecon.data.projections.dicom_views import DICOM_KEYS
 from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.cameras.rigs import circular
 from tests.data.projections.conftest import dicom_image, grey, opened
@@ -128,16 +128,26 @@ VALUES = {
     "AppliedMaskSubtractionFlag": "YES",
     "ConcatenationUID": "1.2.3",
     "InConcatenationNumber": 1,
+    "Planes": 3,
+    "SegmentationType": "FRACTIONAL",
+    "SegmentationFractionalType": "OCCUPANCY",
+    "MaximumFractionalValue": 255,
+    "BurnedInAnnotation": "YES",
+    "LogFlag": "YES",
+    "ImageProcessingApplied": ["FRAME_AVERAGING", "HIGH_PASS_FILTER"],
+    "FluoroscopyPersistenceFlag": "YES",
+    "FluoroscopyLastImageHoldPersistenceFlag": "YES",
+    "RotationOfScannedFilm": 180,
+    "GeometricalProperties": "NON_UNIFORM",
+    "TableMotion": "DYNAMIC",
+    "DetectorShape": "CYLINDRICAL",
+    "FlyingFocalSpotMode": "FFSXY",
 }
 
 
 @pytest.mark.parametrize(
     "key",
-    [
-        key.name
-        for key in (*KEYS, *DICOM_KEYS)
-        if key.use == "refused" and key.name not in PRIVATE.values()
-    ],
+    [name for key in (*KEYS, *DICOM_KEYS) if key.use == "refused" for name in key.names],
 )
 def test_every_attribute_to_refuse_is_refused_by_name(key, tmp_path):
     """DICOM projections with an attribute that changes their pixels otherwise are refused."""

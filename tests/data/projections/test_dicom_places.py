@@ -10,10 +10,10 @@ from pydicom.encaps import encapsulate
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_pixels import pixels_of
+from mvrecon.data.projections.dicom_views import BEAM, CAMERA_PLACES
 from mvrecon.data.projections.exposures import DICOM
-from mvrecon.data.projections.images import BEAM, CAMERA_PLACES
 from mvrecon.data.projections.opening import open_projections
-from tests.data.projections.conftest import VIEWS, dicom_image, grey
+from tests.data.projections.conftest import CT_PD, VIEWS, dicom_image, grey
 from tests.data.projections.test_dicom_pixels import compressed, item, mapping
 
 SHARED, OWN = "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"
@@ -231,7 +231,8 @@ def test_views_of_several_exposures_are_warned_of(name, tmp_path):
     """In each of DICOM's units, in files of their own as in the functional groups of frames, where
     they differ by more than 1 %.
     """
-    kind = str if dictionary_VR(name) in ("CS", "LO", "LT", "SH", "ST") else int
+    kinds = CT_PD[name][1] if name in CT_PD else dictionary_VR(name)
+    kind = str if kinds in ("CS", "LO", "LT", "SH", "ST") else int
     for k in range(3):
         tags = {"InstanceNumber": k, name: kind(100 + 2 * (k // 2))}
         dicom_image(tmp_path / f"{k}.dcm", grey()[k], **tags)

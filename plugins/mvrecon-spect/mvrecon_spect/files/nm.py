@@ -17,95 +17,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused, file_errors, shown
-from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import ONE_FILE, DicomImage, same
+from mvrecon.data.dicom_image import DicomImage, same
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.geometry.cameras.camera import Cameras
-
-WINDOW = "EnergyWindowVector"
-VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")
-#: Frame vectors of dynamic and gated studies.
-TIME = ("PhaseVector", "TimeSliceVector", "RRIntervalVector", "TimeSlotVector")
-Moment = tuple[int, int, int, int]
-#: Sequences whose items the vectors number.
-DESCRIBED = {
-    WINDOW: "EnergyWindowInformationSequence",
-    "DetectorVector": "DetectorInformationSequence",
-    "RotationVector": "RotationInformationSequence",
-    "PhaseVector": "PhaseInformationSequence",
-}
-DURATION = "ActualFrameDuration"
-COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1")
-#: Attributes of measured views besides `mvrecon.data.dicom_image.KEYS`.
-KEYS = (
-    Key("Modality", "refused", "counts of a gamma camera", ("NM",)),
-    Key(
-        "MeasurementUnitsCodeSequence, Units",
-        "compared",
-        f"views are counts: refused unless {', '.join(COUNTS)}",
-    ),
-    Key("RescaleType", "refused", "counts", ("US", *COUNTS)),
-    Key("CorrectedImage", "refused", "with ATTN, SCAT, DECY, RAN or DCAL: counts as measured"),
-    *(
-        Key(f"{name}Correction{method}", "refused", "counts as measured", ("NONE",))
-        for name, method in (("Decay", ""), ("Attenuation", "Method"), ("Scatter", "Method"))
-    ),
-    *(
-        Key(f"{name}Corrected", "refused", "counts as measured", ("NO",))
-        for name in ("Decay", "Attenuation", "Scatter", "Randoms", "DeadTime")
-    ),
-    *(
-        Key(f"{name}Factor", "refused", "counts as measured", (1,))
-        for name in ("Decay", "DeadTime", "DoseCalibration", "SliceSensitivity")
-    ),
-    Key("ScatterFractionFactor", "refused", "counts as measured", (0,)),
-    Key("CountsSource", "refused", "of a transmission", ("EMISSION",)),
-    Key("ImageType", "refused", "with TRANSMISSION or RECON; views are emission as measured"),
-    *(Key(name, "applied", "frame by frame") for name in (WINDOW, *VIEW, *TIME)),
-    *(Key(name, "applied", "numbered by its vector") for name in DESCRIBED.values()),
-    Key("SliceVector", "refused", "where slices differ: a volume"),
-    *ONE_FILE,
-    Key(
-        "StartAngle",
-        "applied",
-        "of the detector with one rotation, else of the rotation; both must have one in common",
-    ),
-    Key("AngularStep", "applied", "not negative"),
-    Key("RotationDirection", "applied"),
-    Key("ScanArc, NumberOfFramesInRotation", "compared", "with AngularStep and AngularViewVector"),
-    Key("RadialPosition", "applied", "as StartAngle; one value, or one of each view"),
-    Key(
-        DURATION,
-        "applied",
-        "of the phase, else of the rotation, else of the image; these must have one in common; "
-        "unknown of gated frames; 0: not stated",
-    ),
-    Key("FrameTime", "applied", "of the one item of GatedInformationSequence"),
-    *(Key(name, "applied") for name in ("PhaseDelay", "PauseBetweenFrames")),
-    Key("NumberOfFramesInPhase", "applied"),
-    Key("PixelSpacing", "compared", "with the cameras' pixel size, by paired"),
-    Key(
-        "AcquisitionDateTime, AcquisitionDate, AcquisitionTime",
-        "compared",
-        "of the windows of a scatter estimate; warned of",
-    ),
-    Key(
-        "EnergyWindowLowerLimit, EnergyWindowUpperLimit",
-        "compared",
-        "with the widths_kev of a scatter estimate",
-    ),
-    Key("ZoomFactor, ZoomCenter", "ignored", "PixelSpacing includes them"),
-    Key("CountsAccumulated, FrameReferenceTime, TimeSlotTime", "ignored", "statistics"),
-    Key(
-        "CenterOfRotationOffset, TypeOfDetectorMotion, TableHeight, TableTraverse, FocalDistance, "
-        "ImagePositionPatient, "
-        "ImageOrientationPatient, PatientPosition, PatientOrientationCodeSequence",
-        "ignored",
-        "the cameras decide",
-    ),
+from mvrecon_spect.files.nm_keys import (
+    DESCRIBED,
+    DURATION,
+    TIME,
+    VIEW,
+    WINDOW,
+    check_alike,
+    check_counts,
 )
-#: Corrections after which views are no counts that a projector with attenuation or scatter makes.
-CORRECTED = {"ATTN", "SCAT", "DECY", "RAN", "DCAL"}
+
+Moment = tuple[int, int, int, int]
 
 
 class View(NamedTuple):
@@ -191,11 +116,12 @@ def read_frames(path: str | Path) -> Iterator[tuple[Frame, NmStudy]]:
     count = image.frames
     if len(set(frame_numbers(image, "SliceVector"))) > 1:
         raise Refused(f"{path}: expected measured views, got the slices of a volume")
-    _check_counts(image)
+    check_counts(image)
     phase, piece, interval, slot, window, *place = (
         frame_numbers(image, name) for name in (*TIME, WINDOW, *VIEW)
     )
     _check_numbered(image)
+    check_alike(image)
     times = list(zip(phase, piece, interval, slot, strict=True))
     places = list(zip(*place, strict=True))
     order = {key: n for n, key in enumerate(zip(times, window, places, strict=True))}
@@ -254,29 +180,6 @@ def paired(study: NmStudy, cameras: Cameras | None) -> Cameras:
             f"has them, got {len(cameras)} of {cameras.shape} and {tuple(steps[0].tolist())} mm"
         )
     return cameras
-
-
-def _check_counts(image: DicomImage) -> None:
-    """Raise for another modality, another unit than counts, or views that are corrected, of a
-    transmission or reconstructed.
-    """
-    if not image.stated("Modality"):
-        raise Refused(f"{image.path}: expected Modality NM, got none")
-    listed = {"CorrectedImage": CORRECTED, "ImageType": {"TRANSMISSION", "RECON"}}
-    image.check([key for key in KEYS if key.name not in (*listed, "SliceVector")])
-    if other := {unit for unit in image.units() if unit.lower() not in COUNTS}:
-        raise Refused(
-            f"{image.path}: expected MeasurementUnitsCodeSequence and Units of counts "
-            f"({', '.join(COUNTS)}), got {', '.join(map(repr, sorted(other)))}"
-        )
-    for name, wrong in listed.items():
-        for _, value in image.stated(name):
-            words = {word for text in np.atleast_1d(value) for word in str(text).upper().split()}
-            if words & wrong:
-                raise Refused(
-                    f"{image.path}: expected emission counts as measured, got {name} with "
-                    f"{', '.join(sorted(words & wrong))}"
-                )
 
 
 def frame_numbers(image: DicomImage, name: str) -> list[int]:

@@ -25,7 +25,8 @@ from mvrecon.data.dicom_image import DicomImage, finite, same
 from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.resample import Planes, Slabs, oriented, storable
 from mvrecon.geometry.grid import Grid
-from mvrecon_spect.files.nm import TIME, VIEW, WINDOW, began, frame_numbers
+from mvrecon_spect.files.nm import began, frame_numbers
+from mvrecon_spect.files.nm_keys import TIME, VIEW, WINDOW
 
 #: Share of a voxel that the directions of a file may move it.
 MOVED = 1e-3
@@ -42,7 +43,18 @@ KEYS = (
     Key("PixelSpacing", "applied"),
     Key("SpacingBetweenSlices", "applied", "also negative; of a single slice or SliceThickness"),
     Key("MeasurementUnitsCodeSequence, Units", "applied", "one unit"),
-    Key("CorrectedImage, SliceProgressionDirection", "ignored", "neither values nor places"),
+    Key(
+        "CorrectedImage, DecayCorrection, DecayFactor, DoseCalibrationFactor, SUVType, "
+        "SliceProgressionDirection",
+        "ignored",
+        "neither values nor places: the unit has them",
+    ),
+    Key(
+        "SliceThickness, SliceLocation, GantryDetectorTilt, ZoomFactor, TableTraverse, "
+        "PatientPosition, PatientOrientationCodeSequence",
+        "ignored",
+        "position, directions and distance decide",
+    ),
 )
 #: NM Image Storage.
 NM = "1.2.840.10008.5.1.4.1.1.20"

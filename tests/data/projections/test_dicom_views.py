@@ -1,0 +1,260 @@
+"""What DICOM projections state of rig, order and values, in standard, private and DICOM-CT-PD's
+attributes, is compared, refused by name, or named in one warning for all files.
+"""
+
+import struct
+import warnings
+
+import numpy as np
+import pydicom
+import pytest
+from pydicom.data import get_testdata_file
+
+from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.opening import open_projections
+from tests.data.projections.conftest import CT_PD, VIEWS, dicom_image, grey
+from tests.data.projections.test_dicom_pixels import item
+from tests.data.projections.test_dicom_places import OWN, nested
+
+COUNT = 4
+
+
+def views(folder, change=None, **tags):
+    """A set of four files of an XA, `change` of the k-th one's data set."""
+    for k in range(COUNT):
+        path = folder / f"{k}.dcm"
+        dicom_image(path, grey()[k], InstanceNumber=k + 1, Modality="XA", **tags)
+        if change:
+            dataset = pydicom.dcmread(path)
+            change(dataset, k)
+            dataset.save_as(path)
+    return folder
+
+
+def warned(path):
+    """The warnings of opening projections, whose grey values are as they are stored."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        stack = open_projections(path)
+        count = len(stack.names)
+        assert np.array_equal(stack.read(0, count), grey()[:count].astype("f4"))
+    return [str(one.message) for one in caught]
+
+
+def unknown(name, value, block=0x10):
+    """Sets an attribute of DICOM-CT-PD as pydicom finds it without its dictionary: bytes."""
+
+    def change(dataset, k):
+        stated = value(k) if callable(value) else value
+        group, element = divmod(CT_PD[name][0], 0x10000)
+        dataset.add_new((group, block), "LO", "DICOM-CT-PD")
+        dataset.add_new((group, block << 8 | element & 0xFF), "UN", stated)
+
+    return change
+
+
+def single(value):
+    return struct.pack("<f", value)
+
+
+def short(value):
+    return struct.pack("<H", value)
+
+
+CT_PD_CASES = {
+    "DetectorShape": (b"FLAT", b"CYLINDRICAL "),
+    "NumberofDetectorRows": (short(6), short(8)),
+    "FlyingFocalSpotMode": (b"FFSNONE ", b"FFSZ"),
+    "LogFlag": (b"NO", b"YES "),
+    "DetectorFocalCenterAxialPosition": (single(3), lambda k: single(k)),
+    "DetectorFocalCenterRadialDistance": (single(595), lambda k: single(595 + k)),
+    "DetectorFocalCenterAngularPosition": (lambda k: single(0.1 * k), None),
+    "ConstantRadialDistance": (single(1085), lambda k: single(1085 + k % 2)),
+    "DetectorCentralElement": (
+        struct.pack("<2f", 4.125, 3.5),
+        lambda k: struct.pack("<2f", 4 + k, 3.5),
+    ),
+    "SourceAngularPositionShift": (single(0), lambda k: single(1e-4 * (-1) ** k)),
+    "SourceAxialPositionShift": (single(0), lambda k: single(0.1 * (k % 2))),
+    "SourceRadialDistanceShift": (single(0), lambda k: single(0.1 * (k % 2))),
+    "SpectrumIndex": (short(1), lambda k: short(1 + k % 2)),
+    "ScatterCorrectionFlag": (b"YES ", lambda k: b"YES " if k else b"NO"),
+    "PhotonStatistics": (lambda k: single(1e5 + k), None),
+    "WaterAttenuationCoefficient": (b"0.0192", None),
+}
+
+
+@pytest.mark.parametrize("block", [0x10, 0x21])
+@pytest.mark.parametrize("name", CT_PD_CASES)
+def test_attributes_of_dicom_ct_pd_of_an_unknown_type(name, block, tmp_path):
+    """A value of a flat detector in one place is read without a warning; another is refused, or
+    warned of once where it differs between views, by name.
+    """
+    good, bad = CT_PD_CASES[name]
+    assert warned(views(tmp_path, unknown(name, good, block))) == []
+    if callable(bad):
+        (text,) = warned(views(tmp_path, unknown(name, bad, block)))
+        assert name in text
+    elif bad is not None:
+        with pytest.raises(Refused, match=name):
+            open_projections(views(tmp_path, unknown(name, bad, block)))
+
+
+def test_the_pixel_of_dicom_ct_pd_is_compared(tmp_path):
+    """With ImagerPixelSpacing, rows first; without it, it is the pixel size."""
+    sizes = {"DetectorElementAxialSpacing": 0.5, "DetectorElementTransverseSpacing": 0.25}
+    assert open_projections(views(tmp_path, **sizes)).pixel_mm == (0.5, 0.25)
+    assert warned(views(tmp_path, ImagerPixelSpacing=[0.5, 0.25], **sizes)) == []
+    with pytest.raises(Refused, match="DetectorElementAxialSpacing, DetectorElementTransverse"):
+        open_projections(views(tmp_path, ImagerPixelSpacing=[0.25, 0.5], **sizes))
+
+
+def test_a_set_has_one_warning_of_places_and_one_of_light(tmp_path):
+    """However many attributes and files state them."""
+
+    def change(dataset, k):
+        dataset.TableHeight, dataset.PatientPosition = float(k), "HFS" if k else "HFP"
+        dataset.KVP, dataset.FilterMaterial = 100 + k, "CU" if k else "AL"
+
+    light, places = warned(views(tmp_path, change))
+    assert all(word in light for word in ("KVP", "FilterMaterial"))
+    assert all(word in places for word in ("TableHeight", "PatientPosition"))
+
+
+@pytest.mark.parametrize(
+    ("names", "way"),
+    [
+        ("ExposureTime XRayTubeCurrent", "ExposureTime*XRayTubeCurrent"),
+        ("ExposureTime XRayTubeCurrent Exposure", "Exposure"),
+        ("KVP ExposureTime", "ExposureTime"),
+        ("AveragePulseWidth", "AveragePulseWidth"),
+    ],
+)
+def test_the_advice_of_a_warning_is_an_option(names, way, tmp_path):
+    """The product of time and current, or the exposure that contains both."""
+
+    def change(dataset, k):
+        for name in names.split():
+            setattr(dataset, name, 100 + 10 * k)
+
+    (text,) = warned(views(tmp_path, change))
+    assert f"views.exposure={way} or <file>" in text
+
+
+@pytest.mark.parametrize(
+    ("creator", "group", "element", "kind", "values"),
+    [
+        ("GEMS_GENIE_1", 0x11, 0x3B, "FD", {1.0: None, 2.0: "Pixel Scale"}),
+        ("GEMS_GENIE_1", 0x11, 0x3C, "FD", {0.0: None, 5.0: "Pixel Offset"}),
+        ("GEMS_GENIE_1", 0x11, 0x3B, "FD", {(1.0, 1.0): None, (1.0, 3.0): "Pixel Scale"}),
+        ("GEMS_GENIE_1", 0x11, 0x19, "FD", {250.0: None}),
+        ("SIEMENS MED NM", 0x33, 0x38, "FL", {1.0: None, 0.5: "Pixel scale factor"}),
+        ("SIEMENS SMS-AX  VIEW 1.0", 0x19, 0x0F, "US", {0: None, 1: "Flipped"}),
+        ("GEMS_DL_IMG_01", 0x19, 0x34, "DS", {"1.5": None}),
+        ("GEMS_PARM_01", 0x43, 0x17, "DS", {"0.095": None}),
+        ("nobody", 0x11, 0x3B, "FD", {2.0: None}),
+    ],
+)
+def test_private_attributes_that_may_scale_or_turn_pixels(
+    creator, group, element, kind, values, tmp_path
+):
+    """Are named in one warning for all files, with creator and value, in a block of any number; a
+    value that changes nothing, an attribute of another kind, and one unknown are not.
+    """
+    for block in (0x10, 0x12):
+        for value, name in values.items():
+
+            def change(dataset, _, block=block, value=value):
+                dataset.add_new((group, block), "LO", creator)
+                stated = list(value) if isinstance(value, tuple) else value
+                dataset.add_new((group, block << 8 | element), kind, stated)
+
+            texts = warned(views(tmp_path, change))
+            assert len(texts) == (name is not None)
+            assert all(name in text and creator in text for text in texts)
+
+
+def test_real_ct_slices_with_private_attributes_open_without_a_warning(tmp_path):
+    """pydicom's slice of a GE scanner, thrice."""
+    dataset = pydicom.dcmread(get_testdata_file("CT_small.dcm"))
+    for k in range(3):
+        dataset.InstanceNumber = k + 1
+        dataset.save_as(tmp_path / f"{k}.dcm")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        values = open_projections(tmp_path).read(0, 1)[0]
+    assert np.array_equal(values, dataset.pixel_array + float(dataset.RescaleIntercept))
+
+
+FRAMES = {
+    "FrameAcquisitionDateTime": [f"202601011200{k:02d}" for k in range(VIEWS)],
+    "FrameReferenceDateTime": [
+        "20260101120000+0100",
+        *(f"202601011200{k:02d}.5+0100" for k in range(VIEWS - 1)),
+    ],
+    "TemporalPositionIndex": list(range(VIEWS)),
+    "DimensionIndexValues": [[1, k + 1] for k in range(VIEWS)],
+}
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_frames_in_another_order_than_they_state_are_refused(name, tmp_path):
+    for values in (FRAMES[name], [*FRAMES[name][1:], FRAMES[name][0]]):
+        groups = [nested("FrameContentSequence", **{name: value}) for value in values]
+        dicom_image(tmp_path / "a.dcm", grey(), **{OWN: groups})
+        if values == FRAMES[name]:
+            assert warned(tmp_path / "a.dcm") == []
+            continue
+        with pytest.raises(Refused, match=f"order of their {name}"):
+            open_projections(tmp_path / "a.dcm")
+
+
+@pytest.mark.parametrize("name", ["PositionOfIsocenterProjection", "TableXPositionToIsocenter"])
+def test_what_moves_between_frames_is_warned_of(name, tmp_path):
+    """In the functional groups of frames, and in such a sequence of the images of files."""
+    sequence = {"P": "FrameDetectorParameters", "T": "IsocenterReferenceSystem"}[name[0]]
+    values = [[4.0, float(k)] if name[0] == "P" else float(k) for k in range(VIEWS)]
+    groups = [nested(f"{sequence}Sequence", **{name: value}) for value in values]
+    dicom_image(tmp_path / "a.dcm", grey(), **{OWN: groups})
+    (text,) = warned(tmp_path / "a.dcm")
+    assert name in text
+    (tmp_path / "a.dcm").unlink()
+
+    def change(dataset, k):
+        setattr(dataset, f"{sequence}Sequence", [item(**{name: values[k]})])
+
+    (text,) = warned(views(tmp_path, change))
+    assert name in text
+
+
+def test_a_table_that_moves_during_a_run_is_warned_of(tmp_path):
+    """By its increments, a number for each frame; those of the arm, and zeros, are allowed."""
+    path = tmp_path / "a.dcm"
+    still = {
+        "TableMotion": "STATIC",
+        "TableVerticalIncrement": [0.0] * VIEWS,
+        "PositionerPrimaryAngleIncrement": [2.0 * k for k in range(VIEWS)],
+    }
+    dicom_image(path, grey(), **still)
+    assert warned(path) == []
+    dicom_image(path, grey(), TableLateralIncrement=[0.5 * k for k in range(VIEWS)])
+    (text,) = warned(path)
+    assert "TableLateralIncrement" in text
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"Modality": "PT"},
+        {"Modality": "RTDOSE"},
+        {"ImageType": ["ORIGINAL", "PRIMARY", "LOCALIZER"]},
+        {"ImageType": ["DERIVED", "SECONDARY", "MPR"]},
+        {"SOPClassUID": "1.2.840.10008.5.1.4.1.1.13.1.1"},
+        {"SOPClassUID": "1.2.840.10008.5.1.4.1.1.2.1"},
+        {"SOPClassUID": "1.2.840.10008.5.1.4.1.1.66.4"},
+    ],
+)
+def test_volumes_doses_and_labels_are_no_projections(tags, tmp_path):
+    dicom_image(tmp_path / "a.dcm", grey(), **tags)
+    with pytest.raises(Refused, match=f"expected projections, got {next(iter(tags))}"):
+        open_projections(tmp_path / "a.dcm")
