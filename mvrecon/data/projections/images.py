@@ -95,7 +95,7 @@ class ImageFiles(ProjectionStack):
         exposures.warn_of_several(folder, places, "which the camera must have")
         self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm = headers[0].pixel_mm
-        self.unknown = sorted({name for head in headers for name in head.unknown})
+        self.unknown = [name for head in headers for name in head.unknown]
         self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,

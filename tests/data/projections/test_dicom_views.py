@@ -12,7 +12,7 @@ from pydicom.data import get_testdata_file
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.opening import open_projections
-from tests.data.projections.conftest import CT_PD, VIEWS, dicom_image, grey
+from tests.data.projections.conftest import CT_PD, VIEWS, dicom_image, grey, opened
 from tests.data.projections.test_dicom_pixels import item
 from tests.data.projections.test_dicom_places import OWN, nested
 
@@ -35,7 +35,7 @@ def warned(path):
     """The warnings of opening projections, whose grey values are as they are stored."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        stack = open_projections(path)
+        stack = opened(path, flat=60_000.0, find_bad_pixels=False).stack
         count = len(stack.names)
         assert np.array_equal(stack.read(0, count), grey()[:count].astype("f4"))
     return [str(one.message) for one in caught]
