@@ -531,7 +531,9 @@ def test_few_views_are_named_with_the_streaks_that_they_make(kind: str, count: i
 
 @pytest.mark.parametrize(("size", "centre"), [(16, (0.0, 0.0)), (16, (24.0, 0.0)), (32, (0, 16.0))])
 @pytest.mark.parametrize("count", [4, 6, 12])
-def test_few_pixels_make_fewer_streaks_than_many(size: int, centre: tuple[float, float], count: int):
+def test_few_pixels_make_fewer_streaks_than_many(
+    size: int, centre: tuple[float, float], count: int
+):
     """Of a disc half as wide as a grid of few pixels, on the axis and aside: what is said is within
     a factor of 1.5 of the streaks, and silence means few. Also tried, to the same factor: fans,
     half fans, cones, volumes, 3 to 60 views, 8 to 128 pixels in the radius, coarse voxels.
