@@ -146,8 +146,8 @@ def test_the_axis_of_a_tilted_rig_is_that_of_its_tilted_plane():
     )
     solid = Phantom((Solids("ellipsoid", bodies[0], turn, bodies[1], values),))
     rig, by = (
-        parallel(90, {"pixels": [32, 56], "pixel_mm": 1.0}, arc_degrees=360.0),
-        Misalignment.none(90),
+        parallel(60, {"pixels": [32, 56], "pixel_mm": 1.0}, arc_degrees=360.0),
+        Misalignment.none(60),
     )
     by.offset_px[:, 0], by.tilt_degrees[:, KINDS["tilt"].column] = 3.0, 1.0
     views = solid.integrals(*misaligned(rig, by).rays(), misaligned(rig, by).ray_extent).float()
