@@ -42,8 +42,9 @@ from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.methods.method import Alignment
 from mvrecon.operators.operator import LinearOperator
 
-#: Voxels along the longest side of the grid that a rig is fitted on; rounds at most.
-MAX_GRID_VOXELS, MAX_ROUNDS = 64, 12
+#: Voxels along the longest side of the grid that a rig is fitted on; rounds at most, and fits of a
+#: tilt, each from the axis that the last one moves: by a fifth of the last time.
+MAX_GRID_VOXELS, MAX_ROUNDS, MAX_FITS = 64, 12, 3
 #: Arrays of the views' size that a fit holds.
 HELD_ARRAYS = 8
 #: f(A, views) -> aligned views, and the errors of their cameras.
@@ -130,10 +131,10 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     """The scan with the rig and the gains fitted to its views, and the estimate in pixels of the
     scan and degrees.
 
-    The axis is that of conjugate rays where these determine it. The fit has at most
-    `MAX_GRID_VOXELS` voxels a side for the scan's box, or where the object extends beyond it, for
-    the field of half of the views, and pixels binned to the size of a voxel's image; an axis that
-    is part of it is then refined on one slice.
+    The axis is that of conjugate rays where these determine it, of a tilted one those of the tilt.
+    The fit has at most `MAX_GRID_VOXELS` voxels a side for the scan's box, or where the object
+    extends beyond it, for the field of half of the views, and pixels binned to the size of a
+    voxel's image; an axis that is part of it is then refined on one slice.
 
     Raises:
         ValueError: as `calibrated`.
@@ -154,20 +155,29 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     rig = scan.cameras.binned(joined)
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
-    known = {} if axis == KEPT else {"offset_u": axis.offset / joined}
-    fit = calibrated(
-        partial(operator_of, grid),
-        rig,
-        views,
-        free,
-        rounds=MAX_ROUNDS,
-        monitor=lambda r: bar(*r),
-        known=known,
-    )
-    by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
+    for _ in range(MAX_FITS):
+        fit = calibrated(
+            partial(operator_of, grid),
+            rig,
+            views,
+            free,
+            rounds=MAX_ROUNDS,
+            monitor=lambda r: bar(*r),
+            known={} if axis == KEPT else {"offset_u": axis.offset / joined},
+        )
+        by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
+        if "offset_u" not in free or "tilt" not in fit.uncertainty:
+            break
+        # other rays are conjugate where the axis is tilted, and the tilt is another where it moves
+        change = conjugate_axis(misaligned(scan.cameras, by), pixels, scan.grid)
+        by.offset_px[:, 0] += change.offset
+        axis = KEPT if change == KEPT else change._replace(offset=by.offset_px[0, 0].item())
+        if abs(change.offset) <= change.uncertainty:
+            break
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
-    if known:
+    if axis != KEPT:
         size["offset_u"] = axis.uncertainty
+        fit = fit._replace(kept=[name for name in fit.kept if name != "offset_u"])
     elif "offset_u" in free and "offset_u" not in fit.kept:
         pixels = (pixels / fit.gains[:, None, None].to(pixels)).to(device)
         rig = misaligned(scan.cameras, by)

@@ -130,7 +130,8 @@ def auto_grid(cameras: Cameras, size: Sequence[int] | None = None, seen_by: floa
             f"{sees(rig, centre[None]).double().mean().item():.0%}; are detector offsets and axes "
             f"right? Of a helix, say, take a smaller share (seen_by), or give the grid explicitly"
         )
-    ends = torch.stack([rig.source, rig.detector_centre]) - centre
+    # a parallel field may be wider than its rays are drawn long
+    ends = torch.stack([rig.source, 2 * rig.detector_centre - rig.origin, rig.origin]) - centre
     high = torch.full_like(low, 2 * ends.norm(dim=-1).max().item())
     for _ in range(BISECTION_STEPS):
         middle = (low + high) / 2

@@ -29,6 +29,9 @@ from mvrecon.geometry.cameras.formats.common import angles_in
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import look_at
 
+#: Where parallel rays without an end start before the axis, and the detector stands behind it.
+BEAM_HALF_MM = 500.0
+
 
 class _Detector(TypedDict, total=False):
     """Settings of a detector, for both directions or (v, u).
@@ -218,7 +221,7 @@ def arc(
 def parallel(
     n_views: PositiveInt,
     detector: DetectorOptions,
-    depth_mm: PositiveFloat = 1000.0,
+    depth_mm: PositiveFloat | None = None,
     arc_degrees: float = 180.0,
     start_degrees: float = 0.0,
     angles: Sequence[float] | str | Path | None = None,
@@ -229,7 +232,8 @@ def parallel(
     Args:
         n_views: number of views, at the angles start + arc k / n_views.
         detector: options of `Detector`: pixels, pixel_mm, offset_mm, each (v, u).
-        depth_mm: rays extend from depth / 2 before to depth / 2 behind the axis.
+        depth_mm: rays extend from depth / 2 before to depth / 2 behind the axis; None: without end,
+            as wide panels, or pixels as the unit of length, need.
         arc_degrees: the range of angles, excluding its end.
         start_degrees: the first angle.
         angles: explicit angles instead of equal steps, as many as `n_views`, or a file of them:
@@ -251,8 +255,10 @@ def parallel(
         >>> A(torch.ones(1, 1, 32, 32, 32)).shape
         torch.Size([1, 1, 90, 32, 48])
     """
-    _check_positive(depth_mm=depth_mm)
     degrees = _angles(n_views, arc_degrees, start_degrees, angles, small_arc)
+    if depth_mm is None:
+        return _about_z(degrees, BEAM_HALF_MM, BEAM_HALF_MM, detector, True, "line")
+    _check_positive(depth_mm=depth_mm)
     return _about_z(degrees, depth_mm / 2, depth_mm / 2, detector, parallel=True)
 
 
@@ -327,12 +333,13 @@ def _about_z(
     back: float,
     detector: DetectorOptions,
     parallel: bool = False,
+    extent: Extent = "segment",
 ) -> Cameras:
     """Beams through the z axis from `front` mm before it to `back` mm behind it."""
     a = torch.deg2rad(torch.as_tensor(degrees, dtype=torch.float64))
     outwards = torch.stack([a.cos(), a.sin(), torch.zeros_like(a)], dim=-1)
     source, centre = front * outwards, -back * outwards
-    return Detector.of(detector).carried(source, centre, look_at(source, centre), parallel)
+    return Detector.of(detector).carried(source, centre, look_at(source, centre), parallel, extent)
 
 
 def _angles(

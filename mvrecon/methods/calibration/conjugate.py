@@ -8,6 +8,7 @@ that a fit of both was more than a pixel off.
 """
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -35,11 +36,11 @@ SEARCHED = 2**17
 
 
 class _Lines(NamedTuple):
-    """The row of each view that is in the plane of the sources, turned by equal steps in radians.
+    """The line of each view that is in the plane of the sources, turned by equal steps in radians.
 
     Args:
-        rows: line integrals of these rows.
-        camera: the first camera.
+        rows: integrals along these lines, one a column.
+        camera: the first camera, whose row 0 is this line.
         orbit: the sources' orbit.
         step: angle between two views.
     """
@@ -111,8 +112,9 @@ def conjugate_axis(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Gr
     periodic objects, which agree as well at another shift.
 
     The uncertainty is three standard errors, from the spread of the contributions of
-    groups of views, and at least 0.02 pixels. An object that moves, or a wrong arc, between views
-    half a turn apart looks like a shift: no conjugate ray tells them apart.
+    groups of views, and at least 0.02 pixels. An object that moves, a wrong arc, or a tilt that the
+    cameras do not have, between views half a turn apart looks like a shift: no conjugate ray tells
+    them apart.
 
     Args:
         cameras: a rig on a circle, with rows across its axis.
@@ -162,14 +164,23 @@ def _lines(cameras: Cameras, views: Float[Tensor, "1 1 m v u"], grid: Grid) -> _
         return None
     steps = torch.deg2rad(torch.remainder(orbit.angles.diff() + 180, 360) - 180)
     step = steps.mean().item()
-    middle = cameras.project(orbit.centre[None])[:, 0, 1].median().item()
+    column, middle = cameras.project(orbit.centre[None])[:, 0, :2].median(dim=0).values.tolist()
     rows, columns = cameras.shape
     if columns < 2 or not -0.5 <= middle <= rows - 0.5:
         return None
     if not (steps - step).abs().max() <= MAX_STEP_DEVIATION * abs(step):
         return None
-    middle = min(max(middle, 0.0), rows - 1.0)
-    first = min(int(middle), max(0, rows - 2))
-    part = views[0, 0, :, first : first + 2].double().cpu()
-    part = part[:, 0] * (1 - middle + first) + part[:, -1] * (middle - first)
-    return _Lines(part, cameras[:1], orbit, step)
+    # of a tilted detector, the line in the plane of the sources crosses its rows
+    slope = -(cameras.u @ orbit.axis / (cameras.v @ orbit.axis)).median().item()
+    u = torch.arange(columns, device=views.device)
+    v = (middle + slope * (u.double() - column)).clamp(0, rows - 1)
+    first = v.long().clamp_max(max(0, rows - 2))
+    before, behind = (
+        views[0, 0, :, k, u].double().cpu() for k in (first, (first + 1).clamp_max(rows - 1))
+    )
+    share, camera = (v - first).cpu(), cameras[:1]
+    shift = (middle - slope * column) * camera.v
+    source = camera.source + shift if camera.parallel else camera.source
+    in_plane = camera.u + slope * camera.v
+    camera = replace(camera, source=source, origin=camera.origin + shift, u=in_plane)
+    return _Lines(before * (1 - share) + behind * share, camera, orbit, step)

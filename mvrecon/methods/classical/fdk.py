@@ -18,7 +18,7 @@ from mvrecon.geometry.cameras.field import half_fan
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.rigid import unit
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.methods.classical.orbit import along, beyond_rows, warn_of_axial_errors
+from mvrecon.methods.classical.orbit import along, beyond_rows, warn_of_axial_errors, warn_of_ends
 from mvrecon.methods.classical.redundancy import RedundancyWeights, redundancy_weights
 from mvrecon.methods.classical.solver import declares
 from mvrecon.methods.classical.truncation import (
@@ -242,6 +242,7 @@ def _plan(cameras: Cameras, grid: Grid, filtering: Filtering) -> FilterPlan:
     rig = (cameras if filtering.weights_from is None else filtering.weights_from)[:]
     scan = redundancy_weights(rig, grid, filtering.max_missing)
     warn_of_axial_errors(rig, scan.orbit, grid)
+    warn_of_ends(rig, scan.orbit, grid)
     if not rig.parallel and half_fan(rig):
         _warn_of_distances((rig.source - scan.orbit.centre).norm(dim=-1))
     # empty columns before and behind the rig's own, and its outermost rows once more, as the

@@ -215,12 +215,7 @@ def beyond_rows(cameras: Cameras, orbit: Orbit, grid: Grid) -> str | None:
     and the bottom of a box near the sources, and beside the slab that all views of a helix have in
     common. One that all views see whole loses nothing.
     """
-    counts = [min(n, MAX_COARSE_VOXELS) for n in grid.size]
-    centres = voxel_centres(grid.divided(counts)).reshape(-1, 3).to(cameras.source)
-    radius, offset = orbit.cylinder(grid)
-    across = centres - orbit.centre - offset
-    inside = across - (across @ orbit.axis)[:, None] * orbit.axis
-    centres = centres[inside.norm(dim=-1) <= radius]
+    centres = _coarse_centres(orbit, grid).to(cameras.source)
     if not len(centres):
         return None
     rows = cameras.project(centres)[..., 1]
@@ -237,6 +232,32 @@ def beyond_rows(cameras: Cameras, orbit: Orbit, grid: Grid) -> str | None:
         f"to {losses.max():.0%}; voxels that all views reach are {where} along the axis, from the "
         f"grid's centre. Take a lower grid, or use sirt"
     )
+
+
+def warn_of_ends(cameras: Cameras, orbit: Orbit, grid: Grid) -> None:
+    """Warn of voxels that lie before the sources or behind the detectors of some views: rays end
+    there, so that these views add nothing to them.
+    """
+    centres = _coarse_centres(orbit, grid).to(cameras.source)
+    lost = (~cameras.valid(cameras.project(centres))).double().mean(dim=0)
+    if len(lost) and (most := lost.max().item()) > WARNED_LOSS:
+        warnings.warn(
+            f"{(lost > WARNED_LOSS).double().mean():.0%} of the voxels in the grid's inscribed "
+            f"cylinder are before the sources or behind the detectors of up to {most:.0%} of the "
+            f"views, where rays end: filtered back-projection reads them low by as much. Are the "
+            f"distances right (sid and sdd, depth_mm of parallel beams)? Else take a smaller grid",
+            stacklevel=2,
+        )
+
+
+def _coarse_centres(orbit: Orbit, grid: Grid) -> Float[Tensor, "n 3"]:
+    """Centres of blocks of voxels in the grid's inscribed cylinder along the axis."""
+    counts = [min(n, MAX_COARSE_VOXELS) for n in grid.size]
+    centres = voxel_centres(grid.divided(counts)).reshape(-1, 3).to(orbit.axis)
+    radius, offset = orbit.cylinder(grid)
+    across = centres - orbit.centre - offset
+    inside = across - (across @ orbit.axis)[:, None] * orbit.axis
+    return centres[inside.norm(dim=-1) <= radius]
 
 
 def fan_coordinate(

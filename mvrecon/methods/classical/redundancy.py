@@ -57,9 +57,11 @@ ASIDE = (0.81, 0.47, 0.35)
 WARNED_MISSING = 0.01
 #: Streaks of a disc half as wide as the grid, root mean square over the grid's cylinder relative to
 #: that of the disc, by half a turn's number of directions in which its edge is measured; and from
-#: which on a warning is given. Measured: 2.9 / n of 2 directions to 4.3 / n of 12 and more; up to
-#: 5.5 / n of a disc a third as wide, aside, and 1.2 / n of one that fills the grid.
-STREAKS, WARNED_STREAKS = 4.0, 0.25
+#: which on a warning is given. Measured: 2.9 / n of 2 directions to 4.3 / n of 12 and more, of a
+#: radius of so many pixels or more; of fewer, the square root of their share of these, as they blur
+#: the edge (1.1 / n of 8, 1.8 of 16, 2.6 of 32). Up to 5.5 / n of a disc a third as wide, aside,
+#: and 1.2 / n of one that fills the grid.
+STREAKS, SHARP_PIXELS, WARNED_STREAKS = 4.2, 58.0, 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,8 +206,9 @@ def _warn_of_streaks(
     gaps = gaps[gaps <= _widest(_usual(gaps))]
     # the more directions lie near one another, or the more unevenly they are weighted, the wider
     step = max((x.square().sum() / x.sum().clamp_min(1e-300)).item() for x in (gaps, cells))
-    streaks = STREAKS * step / math.pi
-    if streaks > WARNED_STREAKS and step > size / radius:
+    blurred = math.sqrt(min(1.0, radius / size / SHARP_PIXELS))
+    streaks = STREAKS * blurred * (step - size / (2 * radius)) / math.pi
+    if streaks > WARNED_STREAKS:
         warnings.warn(
             f"Too few views for filtered back-projection: lines at {radius / 2:.3g} mm from the "
             f"axis of rotation are measured {math.degrees(step):.3g} degrees apart. Expect streaks "

@@ -179,3 +179,14 @@ def test_no_grid_is_chosen_without_a_field_of_view():
         auto_grid(circular(8, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 189.0]}))
     with pytest.raises(ValueError, match="to see the isocentre"):
         auto_grid(circular(8, 400.0, 800.0, {**PLATE, "offset_mm": [0.0, 300.0]}))
+
+
+def test_parallel_beams_see_as_far_as_their_panel_is_wide():
+    """Of pixels as the unit of length, say: 3000 columns of 1 mm. Also tried: 1400 columns, panels
+    aside over a full turn, a stack of rows, whole and half of the views.
+    """
+    rig = parallel(6, {"pixels": [1, 3000], "pixel_mm": 1.0}, arc_degrees=180.0)
+    assert auto_grid(rig, size=(100, 100, 1)).spacing[0] == pytest.approx(30.0, rel=0.16)
+    assert sees(rig[[0]], torch.tensor([[1400.0, 0.0, 0.0], [-9000.0, 20.0, 0.0]])).all()
+    short = parallel(6, {"pixels": [1, 3000], "pixel_mm": 1.0}, depth_mm=800.0)
+    assert not sees(short[[0]], torch.tensor([[1400.0, 0.0, 0.0]])).any()

@@ -200,7 +200,7 @@ def _cameras(record: dict[str, Any], degrees: bool | None) -> Cameras:
     axes = R @ turn
     looking = torch.stack([axes[..., 1], -axes[..., 2], -axes[..., 0]], dim=1)
     plate = Detector(record["nDetector"], record["dDetector"])
-    return plate.carried(start, centre, looking, parallel)
+    return plate.carried(start, centre, looking, parallel, "line" if parallel else "segment")
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
