@@ -78,6 +78,13 @@ def with_a_broken_plugin(folder):
     (folder / "kept_plugin.py").write_text("import mvrecon\nimport sped\n")
 
 
+def returns(what):
+    def with_another_result(folder):
+        (folder / "kept_plugin.py").write_text(PLUGIN.replace("A.T(views)", what))
+
+    return with_another_result
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -101,6 +108,7 @@ def nothing(folder):
 MORE = ("resume={0}/run", "trainer.max_steps=4")
 EVAL = ("checkpoint={0}/run", "hydra.run.dir={0}/new")
 NEW = ("experiment=smoke", "hydra.run.dir={0}/new")
+OWN = (*NEW, "plugins=[kept_plugin]", "+compare.own.name=kept_part")
 SCAN = ("views.path={0}/views.h5", "camera.path={0}/simulated/rig.json", "hydra.run.dir={0}/new")
 CASE = ("scene=volumes", "scene.path={0}/cts", "camera=circular_small", "hydra.run.dir={0}/new")
 TRAINED = ("method=trained", "method.checkpoint={0}/run", "grid={{size: [8,8,8], spacing: 16.0}}")
@@ -130,6 +138,9 @@ TRAINED = ("method=trained", "method.checkpoint={0}/run", "grid={{size: [8,8,8],
         (mvrecon.apps.train, nothing, (*NEW, "init_from={0}/nowhere"), "nowhere"),
         (mvrecon.apps.train, damaged_weights, (*NEW, "init_from={0}/run"), "cross_view_small.ckpt"),
         (mvrecon.apps.train, damaged_data, (*NEW, *CASE[:2], "data.overlap=true"), "a.nii.gz"),
+        (mvrecon.apps.train, returns("None"), OWN, "own: Expected of kept_part a volume"),
+        (mvrecon.apps.train, returns("A.T(views).numpy()"), OWN, "own: Expected of kept_part"),
+        (mvrecon.apps.train, returns("A.T(views)[..., 1:]"), OWN, "own: Expected of kept_part"),
         (
             mvrecon.apps.train,
             damaged_weights,
@@ -158,7 +169,7 @@ def test_a_failing_part_changes_no_file(
     place, tmp_path, monkeypatch, capsys, app, damage, options, message
 ):
     """Plugins that are gone, other or broken; damaged weights, volumes and views, and missing ones;
-    wrong options of every kind of part.
+    wrong options of every kind of part; a plugin that returns anything but a volume.
     """
     folder = tmp_path / "place"
     shutil.copytree(place, folder, ignore=shutil.ignore_patterns("__pycache__"))
