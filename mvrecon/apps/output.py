@@ -13,7 +13,7 @@ from mvrecon.apps.scan import ATTENUATION, Scan
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import check_room, check_writable, written_or_kept
 from mvrecon.core.files.checks import from_home
-from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, flatten
+from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, check_inputs
 from mvrecon.data.attenuation import hounsfield
 from mvrecon.data.volume_files import check_ending, name_of, save_volume, volume_writer
 from mvrecon.geometry.grid import Grid
@@ -69,14 +69,8 @@ class Output:
         written = [out, output.beside(SIGMA_ENDING), *(folder / name for name in PRODUCTS)]
         if settings.calibrate:
             written += [output.beside(RIG_ENDING), output.beside(SCAN_ENDING)]
-        places = {path.resolve() for path in written}
         joint = {str(number): own for number, own in enumerate(settings.joint or ())}
-        for keys, value in flatten({**vars(settings), "joint": joint, "out": None}):
-            if isinstance(value, str) and from_home(value).resolve() in places:
-                raise ValueError(
-                    f"Expected an input that the run does not write, got {'.'.join(keys)}={value}; "
-                    f"choose another out or hydra.run.dir"
-                )
+        check_inputs({**vars(settings), "joint": joint, "out": None}, written)
         return output
 
     def for_scan(self, scan: Scan) -> "Output":

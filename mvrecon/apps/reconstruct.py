@@ -37,6 +37,8 @@ SMALLER_GRID_HINT = (
     "without grid.* the grid is what all views see, or of a half fan what they measure together, "
     "and with grid.seen_by=0.5 alone what half of them see"
 )
+#: Ends it where the grid is what a share of the views see.
+LARGER_SHARE_HINT = "a larger grid.seen_by chooses a smaller grid"
 
 
 def run_reconstruction(settings: ReconstructSettings, folder: Path) -> dict[str, Any]:
@@ -90,7 +92,8 @@ def run_reconstruction(settings: ReconstructSettings, folder: Path) -> dict[str,
     output = output.for_scan(scan)
     corrections.check(scan)
     device = device_of(settings.device)
-    check_coverage(scan.cameras, scan.grid, SMALLER_GRID_HINT)
+    by_share = settings.grid.get("seen_by") is not None
+    check_coverage(scan.cameras, scan.grid, LARGER_SHARE_HINT if by_share else SMALLER_GRID_HINT)
     with run_lock(folder, vars(settings), products=PRODUCTS), Bar() as bar:
         return reconstruct(scan, method, output, corrections, settings, device, bar)
 

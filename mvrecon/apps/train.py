@@ -132,7 +132,7 @@ def task(config: DictConfig) -> float:
     else:
         settings = replace(settings, camera=fitted(settings.camera, settings.grid))
     run_folder.check(folder, vars(settings))
-    finished = (folder / RESULTS).is_file()
+    finished = (folder / RESULTS).is_file() and steps in (None, settings.trainer["max_steps"])
     if finished and HydraConfig.get().mode is RunMode.MULTIRUN:  # of a sweep that is begun again
         tell(f"{folder.name}: its results are there already")
         return _score(read_results(folder))

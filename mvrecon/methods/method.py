@@ -19,7 +19,7 @@ from mvrecon.core.parts import METHODS, PROJECTORS, ClassicalPart, MethodPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
-from mvrecon.operators.operator import LinearOperator, Projector, check_views
+from mvrecon.operators.operator import LinearOperator, Projector, check, check_views
 
 
 class CameraPrior(NamedTuple):
@@ -157,6 +157,9 @@ class Solver(nn.Module):
     Args:
         solve: f(A, views, **options), which returns a volume.
         options: options of the function.
+
+    Raises:
+        TypeError, ValueError: at a call, a function that returns anything but a volume on the grid.
     """
 
     def __init__(self, solve: Callable[..., Tensor], options: Mapping[str, Any]):
@@ -166,10 +169,15 @@ class Solver(nn.Module):
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
         check_views(views, A.cameras)
         if not A.per_sample:
-            return Reconstruction(self.solve(A, views, **self.options))
+            return Reconstruction(self._volume(A, views))
         samples = enumerate(views.split(1))
-        volumes = [self.solve(A.of_sample(i), y, **self.options) for i, y in samples]
-        return Reconstruction(torch.cat(volumes))
+        return Reconstruction(torch.cat([self._volume(A.of_sample(i), y) for i, y in samples]))
+
+    def _volume(self, A: Projector, views: Tensor) -> Tensor:
+        volume = self.solve(A, views, **self.options)
+        name = getattr(self.solve, "__name__", "the method")
+        check(volume, f"of {name} a volume [b c d h w]", A.domain_shape, views.device)
+        return volume
 
 
 def build_method(config: MethodPart) -> nn.Module:

@@ -123,8 +123,8 @@ def ssim_inside(volume: Tensor, truth: Tensor, inside: Tensor, data_range: float
 def ssim_map(
     volume: Float[Tensor, "*n d h w"], truth: Float[Tensor, "*n d h w"], data_range: float
 ) -> Float[Tensor, "*n d h w"]:
-    """Structural similarity around each voxel, without unit (Wang et al. 2004, equation 13); axes
-    of one voxel are ignored.
+    """Structural similarity around each voxel, without unit (Wang et al. 2004, equation 13), nan
+    around values that are not finite; axes of one voxel are ignored.
 
     Raises:
         TypeError: a data range that is not a number.
@@ -142,11 +142,13 @@ def ssim_map(
     volume, truth, relative = volume / scale, truth / scale, data_range / scale
     stable = (0.01 * relative) ** 2, (0.03 * relative) ** 2
     mean, mean_true = _blurred(volume), _blurred(truth)
+    known = mean.isfinite() & mean_true.isfinite()
     product, squares = mean * mean_true, mean**2 + mean_true**2
     covariance = _blurred(volume * truth) - product
     variances = (_blurred(volume**2 + truth**2) - squares).clamp_min(0)  # their sum
     structure = divided(2 * covariance + stable[1], variances + stable[1], 1.0)
-    return structure * divided(2 * product + stable[0], squares + stable[0], 1.0)
+    similar = structure * divided(2 * product + stable[0], squares + stable[0], 1.0)
+    return similar.where(known, math.nan)
 
 
 def _blurred(x: Float[Tensor, "*n d h w"]) -> Float[Tensor, "*n d h w"]:
@@ -183,9 +185,11 @@ def nrmse(x: Float[Tensor, "*n"], truth: Float[Tensor, "*n"], *_: Any) -> float:
         >>> round(mv.nrmse(1.1 * truth, truth), 6)
         0.1
     """
-    error, size = torch.linalg.vector_norm(x - truth).item(), torch.linalg.vector_norm(truth).item()
-    if size == 0:
-        return 0.0 if error == 0 else math.inf
+    top = truth.abs().max().item()
+    if top == 0:
+        return math.inf if x.any() else 0.0
+    scale = math.ldexp(0.5, math.frexp(top)[1])  # no square overflows, and none becomes zero
+    error, size = (torch.linalg.vector_norm(one / scale).item() for one in (x - truth, truth))
     return error / size
 
 

@@ -22,6 +22,7 @@ import lightning.pytorch as L
 import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.pytorch.callbacks import LearningRateMonitor, ProgressBar
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from torch import distributed
 
 from mvrecon.core.machine import silence_libraries, world
@@ -88,6 +89,7 @@ class TrainerOptions(TypedDict, total=False):
     num_nodes: PositiveInt
     devices: PositiveInt | Literal[-1] | str | Sequence[NonNegativeInt]
     accumulate_grad_batches: PositiveInt
+    check_val_every_n_epoch: PositiveInt | None
     gradient_clip_val: NonNegativeFloat | None
     val_check_interval: PositiveInt | PositiveFloat | None
     log_every_n_steps: NonNegativeInt
@@ -185,7 +187,7 @@ def check(settings: TrainSettings, data: SceneData, folder: Path, again: bool = 
     for method, module in without_weights.items():
         try:
             _tried(module, case)
-        except ValueError as error:
+        except (TypeError, ValueError) as error:
             raise ValueError(f"{method}: {error}") from error
 
 
@@ -244,11 +246,13 @@ def fit(method: str, settings: TrainSettings, data: SceneData, folder: Path) -> 
     logs_of(settings, folder, method).mkdir(parents=True, exist_ok=True)
     step = checkpoints.read_newest(last)["global_step"] if begun else 0
     if begun:
-        callbacks.tell(f"{method}: resuming at step {step} of {settings.trainer['max_steps']}")
+        steps = settings.trainer["max_steps"]
+        callbacks.tell(f"{method}: resuming at step {step}" + f" of {steps}" * (steps > 0))
     for logger in trainer.loggers:
         if isinstance(logger, callbacks.TensorBoard | callbacks.MetricsFile):
             logger.rewind(step)
-    with in_one_order(settings.trainer.get("deterministic", False)), report_checkpoint(last):
+    in_order = in_one_order(settings.trainer.get("deterministic", False))
+    with in_order, report_checkpoint(last), misconfigured():
         trainer.fit(
             module, datamodule=data, ckpt_path=str(last) if begun else None, weights_only=True
         )
@@ -274,6 +278,21 @@ def logs_of(settings: TrainSettings, folder: Path, method: str) -> Path:
     return folder if method == next(iter(settings.methods())) else folder / method
 
 
+@contextmanager
+def misconfigured() -> Iterator[None]:
+    """Context in which what Lightning refuses in trainer, callbacks or logger is an error of the
+    settings.
+
+    Raises:
+        ValueError: in place of Lightning's own.
+    """
+    try:
+        yield
+    except MisconfigurationException as error:
+        raise ValueError(f"trainer, callbacks or logger: {error}") from error
+
+
+@misconfigured()
 def build_trainer(settings: TrainSettings, folder: Path, method: str) -> L.Trainer:
     """Build Lightning's trainer of a method: logs and pictures of the main method go to the run
     folder, others' to `<folder>/<method>`, TensorBoard's events always there; the last checkpoint
@@ -281,7 +300,7 @@ def build_trainer(settings: TrainSettings, folder: Path, method: str) -> L.Train
 
     Raises:
         PermissionError: a callback or a logger that would write outside that folder.
-        ValueError: half precision on a CPU.
+        ValueError: half precision on a CPU; options that Lightning refuses.
     """
     logs, last = logs_of(settings, folder, method), checkpoints.unfinished(folder, method)
     hooks: list[Any] = [

@@ -19,7 +19,7 @@ from mvrecon import __version__
 from mvrecon.core import registry
 from mvrecon.core.files.atomic import claimed, write_text
 from mvrecon.core.files.checks import Refused, file_errors, shown, text_of, yaml_of
-from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS
+from mvrecon.core.files.runs import RESULTS, SETTINGS, VERSIONS, check_inputs
 from mvrecon.data import digests
 from mvrecon.geometry.cameras import files
 from mvrecon.training.settings import TrainSettings
@@ -49,15 +49,18 @@ def run_lock(
 
     Raises:
         RuntimeError: another process uses the folder.
-        ValueError, FileExistsError: it is another run's; see `check`.
+        ValueError, FileExistsError: it is another run's, see `check`; a file that a new run would
+            write is an input in its settings.
 
     Warns:
         UserWarning: the run began with other versions or other code of its plugins.
     """
+    own = (file, VERSIONS, DIGESTS_FILE, RIG)
+    if not (folder / file).is_file():
+        check_inputs(settings, [folder / name for name in (*own, RESULTS, *products)])
     with claimed(folder):
         check(folder, settings, file)
         compare_versions(folder, settings)
-        own = (file, VERSIONS, DIGESTS_FILE, RIG)
         new, started = (
             [folder / name for name in names if not (folder / name).exists()]
             for names in (products, own)

@@ -37,6 +37,7 @@ MISTAKES = {
     "grid.spacing=x": r"grid.spacing: expected float > 0 or \[float > 0, .*\], got 'x' \(.*mm",
     "grid.size=[32,32]": r"grid.size: expected int > 0 or \[int > 0, .*, got \[32, 32\]",
     "trainer.max_steps=-5": r"trainer.max_steps: expected int > 0 or -1, got -5$",
+    "trainer.check_val_every_n_epoch=0": r"expected int > 0 or null, got 0",
     "projector.name=dr": r"projector.name: no projector is 'dr'; did you mean 'drr'\?",
     "+projector.metod=joseph": r"'metod'; did you mean 'method'\?",
     "plugins=no_such_module": r"ModuleNotFoundError: .* names 'no_such_module'",

@@ -78,6 +78,13 @@ def with_a_broken_plugin(folder):
     (folder / "kept_plugin.py").write_text("import mvrecon\nimport sped\n")
 
 
+def returns(what):
+    def with_another_result(folder):
+        (folder / "kept_plugin.py").write_text(PLUGIN.replace("A.T(views)", what))
+
+    return with_another_result
+
+
 def cut(path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -94,13 +101,23 @@ def damaged_views(folder):
     cut(folder / "views.h5")
 
 
+def rig_in_the_run_folder(folder):
+    (folder / "mine").mkdir()
+    text = (folder / "simulated" / "rig.json").read_text()
+    (folder / "mine" / "rig.json").write_text(text + "\n")
+    (folder / "link.json").symlink_to(folder / "mine" / "rig.json")
+
+
 def nothing(folder):
     pass
 
 
+GIVEN = ("camera=from_file", "camera.path={0}/mine/rig.json", "hydra.run.dir={0}/mine")
+LINKED = ("camera=from_file", "camera.path={0}/link.json", "hydra.run.dir={0}/mine")
 MORE = ("resume={0}/run", "trainer.max_steps=4")
 EVAL = ("checkpoint={0}/run", "hydra.run.dir={0}/new")
 NEW = ("experiment=smoke", "hydra.run.dir={0}/new")
+OWN = (*NEW, "plugins=[kept_plugin]", "+compare.own.name=kept_part")
 SCAN = ("views.path={0}/views.h5", "camera.path={0}/simulated/rig.json", "hydra.run.dir={0}/new")
 CASE = ("scene=volumes", "scene.path={0}/cts", "camera=circular_small", "hydra.run.dir={0}/new")
 TRAINED = ("method=trained", "method.checkpoint={0}/run", "grid={{size: [8,8,8], spacing: 16.0}}")
@@ -130,6 +147,9 @@ TRAINED = ("method=trained", "method.checkpoint={0}/run", "grid={{size: [8,8,8],
         (mvrecon.apps.train, nothing, (*NEW, "init_from={0}/nowhere"), "nowhere"),
         (mvrecon.apps.train, damaged_weights, (*NEW, "init_from={0}/run"), "cross_view_small.ckpt"),
         (mvrecon.apps.train, damaged_data, (*NEW, *CASE[:2], "data.overlap=true"), "a.nii.gz"),
+        (mvrecon.apps.train, returns("None"), OWN, "own: Expected of kept_part a volume"),
+        (mvrecon.apps.train, returns("A.T(views).numpy()"), OWN, "own: Expected of kept_part"),
+        (mvrecon.apps.train, returns("A.T(views)[..., 1:]"), OWN, "own: Expected of kept_part"),
         (
             mvrecon.apps.train,
             damaged_weights,
@@ -140,6 +160,9 @@ TRAINED = ("method=trained", "method.checkpoint={0}/run", "grid={{size: [8,8,8],
         (mvrecon.apps.eval, damaged_weights, EVAL, "cross_view_small.ckpt"),
         (mvrecon.apps.eval, damaged_data, EVAL, "have changed since"),
         (mvrecon.apps.eval, nothing, (*EVAL, "+compare.more={{name: sirt, sped: 1}}"), "sped"),
+        (mvrecon.apps.train, rig_in_the_run_folder, (NEW[0], *GIVEN), "an input"),
+        (mvrecon.apps.simulate, rig_in_the_run_folder, ("scene=ellipsoids", *GIVEN), "an input"),
+        (mvrecon.apps.simulate, rig_in_the_run_folder, ("scene=ellipsoids", *LINKED), "an input"),
         (mvrecon.apps.simulate, damaged_data, CASE, "a.nii.gz"),
         (mvrecon.apps.simulate, nothing, (*CASE, "camera=parallel", "rtk=true"), "cone"),
         (mvrecon.apps.simulate, nothing, (*CASE, "projector=drr", "projector.method=sped"), "sped"),
@@ -158,7 +181,8 @@ def test_a_failing_part_changes_no_file(
     place, tmp_path, monkeypatch, capsys, app, damage, options, message
 ):
     """Plugins that are gone, other or broken; damaged weights, volumes and views, and missing ones;
-    wrong options of every kind of part.
+    wrong options of every kind of part; a plugin that returns anything but a volume;
+    a rig in the run's own folder, under the name of a file that the run writes.
     """
     folder = tmp_path / "place"
     shutil.copytree(place, folder, ignore=shutil.ignore_patterns("__pycache__"))

@@ -13,6 +13,7 @@ from mvrecon.report.metrics import (
     Metric,
     case_metrics,
     declared,
+    nrmse,
     ssim_map,
     view_nrmse,
     volume_metrics,
@@ -60,6 +61,27 @@ def test_nrmse_is_the_relative_norm_of_the_error():
     assert volume_metrics(0.75 * truth, truth, inside, 1.0)["nrmse"] == pytest.approx(
         0.25, abs=1e-6
     )
+
+
+@pytest.mark.parametrize("scale", [1e-37, 1e-30, 1e-21, 1.0, 1e21, 1e30, 1e38])
+def test_nrmse_does_not_depend_on_the_scale(scale):
+    """In float32, whose squares overflow at 1e19 and vanish at 1e-23: NRMSE was nan, or 0. Also
+    tried: 1e200 in float64.
+    """
+    truth = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(0)) + 0.1
+    assert math.isclose(nrmse(1.1 * truth * scale, truth * scale), 0.1, rel_tol=1e-5)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("share", ["one", "all"])
+def test_values_that_are_not_finite_have_no_similarity(value, share):
+    """SSIM of a volume of NaN was 1, that of a perfect one; a truth with NaN, too."""
+    volume = torch.rand(1, 8, 8, 8, generator=torch.Generator().manual_seed(0))
+    truth, inside = volume.clone(), torch.ones_like(volume, dtype=torch.bool)
+    volume[(0, 0, 0, 0) if share == "one" else ...] = value
+    figures = volume_metrics(volume, truth, inside, 1.0)
+    assert all(math.isnan(figures[name]) for name in ("psnr", "ssim", "ssim_inside"))
+    assert not math.isfinite(figures["nrmse"])
 
 
 def test_inside_metrics_include_only_the_object():

@@ -227,3 +227,25 @@ def test_a_run_shorter_than_the_interval_of_validations_has_one(settings, tmp_pa
         length = {"max_steps": steps, "accumulate_grad_batches": batches}
         built = fit.build_trainer(replace(settings, trainer=trainer | length), tmp_path, label)
         assert built.val_check_interval == interval
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"val_check_interval": 0.5, "check_val_every_n_epoch": None},
+        {"limit_train_batches": 1.5},
+        {"gradient_clip_algorithm": "sped"},
+        {"max_time": "sped"},
+        {"profiler": "sped"},
+        {"enable_checkpointing": False},
+    ],
+)
+def test_what_lightning_refuses_is_an_error_of_the_settings(options, settings, tmp_path):
+    """Not a traceback; also tried: other limits, fast_dev_run=-1, and of callbacks, a Timer without
+    a time and a ModelCheckpoint of a value that is not logged.
+    """
+    label, trainer = settings.method["name"], {**settings.trainer, **options}
+    callbacks = {"best": {"_target_": "lightning.pytorch.callbacks.ModelCheckpoint"}}
+    given = replace(settings, trainer=trainer, callbacks=callbacks)
+    with pytest.raises(ValueError, match=r"trainer, callbacks or logger: .*"):
+        fit.build_trainer(given, tmp_path, label)

@@ -57,6 +57,19 @@ def test_a_finished_run_continues_to_more_steps_as_if_never_finished(short, tmp_
     assert rows[0][METHOD]["psnr"]["values"] == rows[1][METHOD]["psnr"]["values"]
 
 
+def test_a_sweep_lengthens_finished_runs(short, tmp_path):
+    """Of several runs, and in several steps; with as many steps as before it repeats none."""
+    folders = [tmp_path / name for name in "ab"]
+    for folder in folders:
+        shutil.copytree(short, folder)
+    sweep = ("-m", f"hydra.sweep.dir={tmp_path}/sweep", f"resume={folders[0]},{folders[1]}")
+    for given in (SHORT + 1, f"{SHORT + 1},{SHORT + 2}"):
+        assert call(mvrecon.apps.train, *sweep, f"trainer.max_steps={given}") == 0
+    for folder in folders:
+        row = json.loads((folder / "results.json").read_text())["methods"][METHOD]
+        assert row["train_steps"] == SHORT + 2
+
+
 @pytest.mark.parametrize("end", [SHORT, 10])
 def test_averages_continue_from_the_trained_weights(end, tmp_path):
     """With averages of every other step, a run that ended within an epoch or at its end and is

@@ -6,10 +6,11 @@ import signal
 import sys
 import threading
 import warnings
+from _thread import interrupt_main
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path, PurePosixPath
 from traceback import walk_tb
 from typing import Any
@@ -36,6 +37,8 @@ PROGRAM_FAULTS = (KeyError, IndexError, RecursionError, NotImplementedError)
 #: What OmegaConf adds to its messages for programmers.
 OMEGACONF_DETAILS = re.compile(r"\s*(full_key|object_type|reference_type)\b.*")
 
+#: Seconds after which a signal is raised again.
+AGAIN_SECONDS = 0.01
 #: A number in a sentence; digits within a name, such as that of a file, distinguish warnings.
 NUMBER = re.compile(r"[^\w\s/\\]*\d[\d.,:e+x-]*[^\w\s/\\]*")
 
@@ -57,7 +60,8 @@ def one_line(app: str) -> Iterator[None]:
     the first one is printed, and at the end how many followed.
 
     SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C does: files that are
-    not complete are removed, and the status is 128 plus the number of the signal.
+    not complete are removed, and the status is 128 plus the number of the signal. Python ignores
+    the error of a signal that arrives while an object is freed; it is raised again.
 
     Args:
         app: name of the app, with which the line begins.
@@ -67,9 +71,11 @@ def one_line(app: str) -> Iterator[None]:
     """
     traceback_asked, shown = os.environ.get(FULL_ERROR), warnings.formatwarning
     given: Counter[tuple[str, ...]] = Counter()
+    terminated: list[signal.Signals] = []
 
     def terminate(number: int, _: object) -> None:
-        raise KeyboardInterrupt(signal.Signals(number))
+        terminated.append(signal.Signals(number))
+        raise KeyboardInterrupt(terminated[-1])
 
     def line(message: Warning | str, category: type[Warning], *_: object, **__: object) -> str:
         text = f"{app}: {category.__name__}: {message}\n"
@@ -83,7 +89,7 @@ def one_line(app: str) -> Iterator[None]:
         with _handled(terminate):
             yield
     except KeyboardInterrupt as stop:
-        by = stop.args[0] if stop.args else signal.SIGINT
+        by = next(reversed(terminated), signal.SIGINT)  # a task may raise its own in the end
         sys.stderr.write(f"{app}: stopped by {'Ctrl-C' if by == signal.SIGINT else by.name}\n")
         raise SystemExit(128 + by) from stop
     except (TaskFailed, *USER_ERRORS) as raised:
@@ -119,11 +125,24 @@ def _handled(terminate: Callable[[int, Any], None]) -> Iterator[None]:
         and (number := getattr(signal, name, None))  # Windows has no SIGHUP
         and signal.getsignal(number) is signal.SIG_DFL
     }
+    unraisable, sys.unraisablehook = sys.unraisablehook, partial(_again, sys.unraisablehook)
     try:
         yield
     finally:
+        sys.unraisablehook = unraisable
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _again(report: Callable[[Any], Any], ignored: Any) -> None:
+    """Raise a signal again whose error Python ignores, as in a callback of a weak reference: it
+    comes there often, as to what follows a long kernel. Other errors are reported.
+    """
+    stop = ignored.exc_value
+    if not isinstance(stop, KeyboardInterrupt):
+        return report(ignored)
+    number = stop.args[0] if stop.args else signal.SIGINT
+    threading.Timer(AGAIN_SECONDS, interrupt_main, [number]).start()  # not within this callback
 
 
 class TaskFailed(BaseException):

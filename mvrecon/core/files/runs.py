@@ -5,7 +5,7 @@ weights.
 import csv
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NotRequired
 
@@ -162,3 +162,18 @@ def of_weights(path: str | os.PathLike[str]) -> Path:
     return (
         local.absolute() if local.exists() else shipped_weights().get(str(path), local.absolute())
     )
+
+
+def check_inputs(settings: Mapping[str, Any], written: Iterable[Path]) -> None:
+    """Check that no path in settings is of a file that a run writes, also through links.
+
+    Raises:
+        ValueError: one is; the message names the setting.
+    """
+    places = {path.resolve() for path in written}
+    for keys, value in flatten(settings):
+        if isinstance(value, str) and from_home(value).resolve() in places:
+            raise ValueError(
+                f"Expected an input that the run does not write, got "
+                f"{'.'.join(map(str, keys))}={value}; choose another hydra.run.dir (or out)"
+            )
