@@ -283,7 +283,7 @@ class RayTransform(FixedGeometry):
         return super().subset(selection)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
-        """The operator for the voxels of a box and for some cameras, with the same options. Where the
+        """The operator for the voxels of a box and for some cameras, with the same options. If the
         cameras require a gradient, the views of all are computed.
 
         Raises:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from mvrecon.core.numbers import divided
 from mvrecon.core.parts import MethodPart
 from mvrecon.core.quantities import PositiveInt
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.calibration.alignment import (
     BLUR_SIGMA_PX,
     MAX_SHIFT_PX,
@@ -73,7 +74,7 @@ class CorrectedViews(NamedTuple):
     """Aligned views.
 
     Args:
-        views: aligned views, in the unit of the measured ones.
+        views: aligned views, in the unit of the measured ones; float32 of half precision.
         alignment: estimated errors of the cameras.
     """
 
@@ -113,6 +114,7 @@ def self_aligned(
     if alternations < 1:
         raise ValueError(f"expected at least one alternation, got {alternations}")
     check_finite(views, on_gpu=False)
+    views = to_accumulation_dtype(views)
     by, volume, expected = Alignment.none(views), None, views
     weights = sirt_weights(A, views.dtype)
     cameras, centre = A.cameras, A.grid.centre

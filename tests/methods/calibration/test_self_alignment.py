@@ -62,6 +62,15 @@ def test_exact_views_do_not_change(measurement):
     assert by.shift_px.abs().max() < 0.06 and (by.gain - 1).abs().max() < 0.02
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_views_of_any_precision_are_aligned(measurement, disturbed, dtype):
+    A, views = measurement[0], disturbed[0][:1]
+    out = Aligned({"name": "sirt", "iterations": 2})(views.to(dtype), A)
+    expected = self_aligned(A, views).alignment
+    assert (out.alignment.shift_px - expected.shift_px).abs().max() < 0.05
+    assert out.volume.dtype == torch.promote_types(dtype, torch.float32)
+
+
 def test_object_motion_and_a_common_gain_are_not_camera_errors(measurement):
     A, _ = measurement
     moves = motions(A.cameras, A.grid.centre).float()
