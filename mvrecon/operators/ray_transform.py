@@ -23,6 +23,7 @@ from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.memo import FixedGeometry, kept
 from mvrecon.operators.operator import (
+    Cropped,
     LinearOperator,
     PixelIntegral,
     Projector,
@@ -282,13 +283,16 @@ class RayTransform(FixedGeometry):
         return super().subset(selection)
 
     def cropped(self, box: Box, views: Sequence[int] | None = None) -> Projector:
-        """The operator for the voxels of a box and for some cameras, with the same options.
+        """The operator for the voxels of a box and for some cameras, with the same options. If the
+        cameras require a gradient, the views of all are computed.
 
         Raises:
             ValueError: as `cameras`.
         """
         if "crop" not in self.capabilities:
             return super().cropped(box, views)
+        if views is not None and self.pose_gradient:  # selected vectors would not follow the rig
+            return Cropped(self.cropped(box), Box.whole(box.shape), views)
         support = None if self.support is None else self.support[box.slices].cpu()
         rig = self.cameras
         cameras = rig if views is None else rig[torch.tensor(views, device=rig.source.device)]

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from mvrecon.core.numbers import divided
 from mvrecon.core.parts import MethodPart
 from mvrecon.core.quantities import PositiveInt
+from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.calibration.alignment import (
     BLUR_SIGMA_PX,
     MAX_SHIFT_PX,
@@ -61,17 +62,19 @@ ITERATIONS_FROM_ZERO = 30
 FOLDS, MAX_ROUNDS = 4, 4
 #: A view is lost if its prediction explains less of its square sum than the first part of what is
 #: explained of the best quarter of the views, or less than the second part and leaves more than so
-#: many times the residual of a constant; an empty view if its prediction reaches the last part of
-#: the others' median norm.
+#: many times the residual of a constant; an empty view if the projection of the volume of all
+#: views, itself included, has more than the last part of the others' median norm: right ones have
+#: 0.02 to 0.16, right ones beside dead ones 0.04 to 0.23, dead ones 0.4 to 1.8, and 0.23 to 0.85
+#: where thin rays miss most voxels. More iterations would put the object between such rays.
 MIN_EXPLAINED, MIN_FAIRLY_EXPLAINED, MAX_CONSTANT_RATIO = 0.1, 0.9, 2.0
-MAX_EMPTY_NORM = 0.25
+MAX_EMPTY_NORM, EMPTY_ITERATIONS = 0.25, 12
 
 
 class CorrectedViews(NamedTuple):
     """Aligned views.
 
     Args:
-        views: aligned views, in the unit of the measured ones.
+        views: aligned views, in the unit of the measured ones; float32 of half precision.
         alignment: estimated errors of the cameras.
     """
 
@@ -111,6 +114,7 @@ def self_aligned(
     if alternations < 1:
         raise ValueError(f"expected at least one alternation, got {alternations}")
     check_finite(views, on_gpu=False)
+    views = to_accumulation_dtype(views)
     by, volume, expected = Alignment.none(views), None, views
     weights = sirt_weights(A, views.dtype)
     cameras, centre = A.cameras, A.grid.centre
@@ -254,6 +258,7 @@ def agreement(
     of at most `MAX_SHIFT_PX` pixels, so neither makes it lost. Empty views predict nothing. Views
     that are not explained are left out of the next round's predictions, at most half of them, as
     they and their gains, which are arbitrary, would spoil these; the others are divided by theirs.
+    At most half of the views are lost only if the others predict one another better without them.
 
     Args:
         A: the operator of the nominal cameras.
@@ -289,14 +294,33 @@ def agreement(
     level = _relative(gain, ~unlike & ~blank).log()
     outlying = level.abs().amax(dim=1, keepdim=True) > MIN_OUTLYING_LOG_GAIN
     gain = torch.where(outlying & ~(unlike | blank), level, 0.0).exp()
-    if not views.is_cuda and not blank.any() and (gain == 1).all():
-        return Agreement(unlike, gain)  # no gain to try, no empty view to predict
-    gain, fit = _consistent(A, views, gain, ~unlike & ~blank, weights)
-    y = views / gain[:, None, :, None, None]
-    norms, expected = (torch.linalg.vector_norm(z, dim=(1, 3, 4)) for z in (y, fit))
-    usual = norms.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
-    missed = blank & (expected > MAX_EMPTY_NORM * usual)
-    return Agreement(unlike | missed, gain)
+    lost = unlike
+    if views.is_cuda or blank.any() or (gain != 1).any():  # else no gain to try, no empty view
+        gain = _consistent(A, views, gain, ~unlike & ~blank, weights)
+        # the object may lie where empty views alone would have seen it, so they are included
+        part = _among(A, (~unlike)[:, None, :, None, None].to(views).expand_as(views), weights)
+        y = views / gain[:, None, :, None, None]
+        fit = A(sirt(A, y, EMPTY_ITERATIONS, weights=part, momentum=True))
+        norm = torch.linalg.vector_norm(fit, dim=(1, 3, 4))
+        usual = norm.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
+        lost = unlike | (blank & (norm > MAX_EMPTY_NORM * usual))
+    if not views.is_cuda and not lost.any():
+        return Agreement(lost, gain)
+    many = 2 * lost.sum(dim=1) > lost.shape[1]
+    better = _predict_better_without(A, views / gain[:, None, :, None, None], lost, weights)
+    return Agreement(lost & (many | better)[:, None], gain)
+
+
+def _predict_better_without(
+    A: Projector, views: Float[Tensor, "b 1 m v u"], lost: Bool[Tensor, "b m"], weights: SirtWeights
+) -> Bool[Tensor, " b"]:
+    """Whether the other views predict one another better without the lost ones than with them."""
+    others = (~lost)[:, None, :, None, None]
+    errors = [
+        (others * (_predicted(A, views, keep, weights) - views)).square().sum(dim=(1, 2, 3, 4))
+        for keep in (~lost, torch.ones_like(lost))
+    ]
+    return errors[0] < errors[1]
 
 
 def _consistent(
@@ -305,17 +329,14 @@ def _consistent(
     gain: Float[Tensor, "b m"],
     keep: Bool[Tensor, "b m"],
     weights: SirtWeights,
-) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b 1 m v u"]]:
-    """The gains of samples whose views they make much more consistent, else 1; and the projection
-    of the volume of the kept views, divided by these gains.
-    """
+) -> Float[Tensor, "b m"]:
+    """The gains of samples whose views they make much more consistent, else 1."""
     kept = keep[:, None, :, None, None].to(views)
     part = _among(A, kept.expand_as(views), weights)
     outlying = (gain.log().abs() > MIN_OUTLYING_LOG_GAIN)[:, None, :, None, None]
-    tried, rests, fits = kept * outlying, [], []
+    tried, rests = kept * outlying, []
     for y in (views / gain[:, None, :, None, None], views):
-        fits.append(A(sirt(A, y, ITERATIONS_FROM_ZERO, weights=part, momentum=True)))
-        rest = fits[-1] - y
+        rest = A(sirt(A, y, ITERATIONS_FROM_ZERO, weights=part, momentum=True)) - y
         sums = [(some * y).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
         left = [(some * rest).square().sum(dim=(1, 2, 3, 4)) for some in (tried, kept)]
         rests.append([divided(a, b) for a, b in zip(left, sums, strict=True)])
@@ -323,9 +344,7 @@ def _consistent(
     much = (of_tried < MAX_RESIDUAL_RATIO**2 * of_tried_before) | (
         of_all < MAX_RESIDUAL_RATIO**2 * of_all_before
     )
-    better = much & (of_all < of_all_before)
-    fit = torch.where(better[:, None, None, None, None], fits[0], fits[1])
-    return torch.where(better[:, None], gain, 1.0), fit
+    return torch.where((much & (of_all < of_all_before))[:, None], gain, 1.0)
 
 
 def _relative(gain: Float[Tensor, "b m"], among: Bool[Tensor, "b m"]) -> Float[Tensor, "b m"]:

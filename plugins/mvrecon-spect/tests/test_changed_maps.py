@@ -15,7 +15,7 @@ import torch
 from mvrecon.data.module import SceneData
 from mvrecon.data.volume_files import save_volume
 from mvrecon.geometry.cameras.rigs import dcspect80
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Box, Grid
 from mvrecon.methods.calibration import self_alignment
 from mvrecon.methods.method import build_method
 from mvrecon.operators.memo import determinants
@@ -202,6 +202,25 @@ def test_cameras_that_move_are_followed_or_refused(kind, gradient):
     B = KINDS[kind](body(), fixed)
     for one, other in ((A(x), B(x)), (A.T(old), B.T(old))):
         torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6 * other.abs().max().item())
+
+
+@pytest.mark.pairwise(part=["subset", "crop"], graph=[False, True], mu=[False, True])
+def test_parts_follow_cameras_that_are_optimised(part, graph, mu):
+    """Also tried: plain and blurred, supports, products; central differences."""
+    rig, x = deepcopy(RIG), torch.rand(1, 1, *GRID.shape).double()
+    rig.source.requires_grad_()
+    A = Spect(GRID, rig, mu=body() if mu else None)
+    with torch.set_grad_enabled(graph):
+        B = view_subset(A, [4, 1]) if part == "subset" else A.cropped(Box.whole(GRID.shape), [4, 1])
+    assert B.pose_gradient
+    for _ in range(2):
+        views = B(x), A(x)[:, :, [4, 1]]
+        torch.testing.assert_close(*views, rtol=1e-6, atol=0)
+        slopes = [torch.autograd.grad(y.square().sum(), rig.source)[0] for y in views]
+        assert slopes[1].any()
+        torch.testing.assert_close(*slopes, rtol=1e-5, atol=1e-9)
+        with torch.no_grad():
+            rig.source.add_(1.0)
 
 
 @torch.no_grad()

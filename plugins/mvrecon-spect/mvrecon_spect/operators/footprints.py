@@ -29,6 +29,7 @@ from mvrecon.kernels.operator import accumulation_dtype, choose_backend, to_accu
 from mvrecon.kernels.self_test import Errors
 from mvrecon.operators.memo import FixedGeometry, grid_key, kept
 from mvrecon.operators.operator import (
+    Cropped,
     LinearOperator,
     PixelIntegral,
     Projector,
@@ -237,7 +238,9 @@ class Footprints(FixedGeometry):
         """The same operator on a finer grid, with the same attenuation map."""
         return self._like(self.grid.refined(factor), None)
 
-    def _like(self, grid: Grid, views: Sequence[int] | None) -> "Footprints":
+    def _like(self, grid: Grid, views: Sequence[int] | None) -> Projector:
+        if views is not None and self.pose_gradient:  # selected vectors would not follow the rig
+            return Cropped(self._like(grid, None), Box.whole(grid.shape), views)
         cameras = self.cameras if views is None else self.cameras[list(views)]
         matter = None if self.mu is None else Matter(self.mu, self.matter)
         other = Footprints(grid, cameras, self.hole, self.response, matter, self.backend)
