@@ -158,6 +158,7 @@ EFFECTS = {
     r"pixel offset|rescale intercept": 0,
     r"(image|pet) flip|image rotation(?! angle)|flipped|flip flag|mirror": 0,
     r"(decay|scatter|attenuation)\b.* flag": 0,
+    r"decay correction$": "NONE",
 }
 #: Sequences of functional groups that describe other images.
 OTHERS = re.compile("Referenced|Source|Derivation|Contributing|Original|ConversionSource")
@@ -333,7 +334,7 @@ class DicomImage:
             for _, holders in (*self._image, *self._frames):
                 for group, tag in holders.get("", ()):
                     name = _private_name(group, tag)
-                    value = group[tag].value if has_effect(name, None, EFFECTS) else ()
+                    value = group[tag].value if has_effect(name, np.nan, EFFECTS) else ()
                     stated = [] if _empty(value) else np.atleast_1d(value).tolist()
                     if any(has_effect(name, one, EFFECTS) for one in stated):
                         found.append(f"{name} {shown(value)} of {group[tag].private_creator}")

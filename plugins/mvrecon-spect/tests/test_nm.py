@@ -304,7 +304,7 @@ def several(name: str, *values: float) -> dict:
         return {"DetectorInformationSequence": items}
     if name != "TimeSlotTime":
         return {"RotationInformationSequence": items, "RotationVector": [1] * 12}
-    intervals = [item(Dataset, FrameTime=50.0, TimeSlotInformationSequence=items)] * 2
+    intervals = [item(Dataset, FrameTime=values[0], TimeSlotInformationSequence=items)] * 2
     return {"GatedInformationSequence": [item(Dataset, DataInformationSequence=intervals)]}
 
 
@@ -334,6 +334,7 @@ def test_what_changes_within_a_study_is_warned_of_once(tmp_path: Path, name: str
     [
         ("SIEMENS MED NM", 0x33, 0x38, "FL", {1.0: None, 0.5: "Pixel scale factor"}),
         ("SIEMENS MED NM", 0x55, 0x56, "SS", {0: None, 1: "Decay Corr"}),
+        ("SIEMENS MED NM", 0x57, 0x04, "LO", {"NONE": None, "START": "Decay correction"}),
         ("SIEMENS MED NM", 0x57, 0x07, "FL", {1.0: None, 2.0: "Rescale Slope"}),
         ("SIEMENS MED NM", 0x55, 0x72, "SS", {3: None}),  # gains in x
         ("GEMS_GENIE_1", 0x13, 0x15, "FD", {1.0: None, 0.01: "Fscalar"}),

@@ -469,3 +469,24 @@ def test_windows_that_contradict_an_estimate_of_scatter(tmp_path: Path):
             warnings.simplefilter("always")
             scan(path, rig(*ANGLES), chosen, f"scatter={{name: dew, lower: {later}}}")
         assert any("6:00:00 h apart" in str(one.message) for one in caught) is warned
+
+
+@pytest.mark.parametrize(
+    ("frame", "slots", "warned"),
+    [
+        (214.25, (214.0, 215.0), False),  # 857 ms in 4 slots, rounded
+        (None, (214.0, 215.0), False),
+        (214.25, (None, None), False),
+        (214.25, (214.25, 180.0), True),  # a shorter last slot
+        (214.25, (100.0, 100.0), True),  # equal slots of another duration than nominal
+        (100.0, (214.25, 214.25), True),
+    ],
+)
+def test_slots_are_compared_with_their_nominal_time(tmp_path: Path, frame, slots, warned):
+    items = [item(pydicom.Dataset, TimeSlotTime=slot) for slot in slots]
+    interval = item(pydicom.Dataset, FrameTime=frame, TimeSlotInformationSequence=items)
+    gate = item(pydicom.Dataset, DataInformationSequence=[interval])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        list(read_frames(study(tmp_path / "a.dcm", GatedInformationSequence=[gate])))
+    assert ["TimeSlotTime" in str(one.message) for one in caught] == [True] * warned

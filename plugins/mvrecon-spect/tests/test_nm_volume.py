@@ -1,5 +1,6 @@
 """Volumes as DICOM NM lie where they lay, as SimpleITK and pydicom read them."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +167,10 @@ PLACE = (-13.0, 15.0, 21.0)
         ({"DetectorInformationSequence": []}, "ImagePositionPatient"),
         ({"PixelAspectRatio": [1, 1]}, "PixelAspectRatio"),
         ({"SpacingBetweenSlices": None}, "SpacingBetweenSlices"),
+        (
+            {"SliceVector": [1, 2, 3] * 2 + [1], "TimeSlotVector": [1, 1, 1, 2, 2, 2, 3]},
+            "TimeSlotVector",
+        ),
         ({"Units": "BQML"}, "MeasurementUnitsCodeSequence and Units"),
         ({"HighBit": 11}, "HighBit 15"),
         ({"RescaleSlope": 3.0}, "RealWorldValueMappingSequence"),
@@ -190,3 +195,26 @@ def test_an_nm_volume_that_contradicts_itself_is_refused(
             continue
         with pytest.raises(ValueError, match=message):
             read_nm_volume(tmp_path / "w.dcm")
+
+
+@pytest.mark.parametrize(
+    ("creator", "group", "element", "value", "name"),
+    [
+        ("GEMS_GENIE_1", 0x11, 0x3B, 2.0, "Pixel Scale"),
+        ("GEMS_GENIE_1", 0x11, 0x3B, 1.0, None),
+        ("SIEMENS MED NM", 0x57, 0x07, 0.5, "Rescale Slope"),
+    ],
+)
+def test_private_attributes_that_may_scale_a_volume_are_warned_of(
+    tmp_path: Path, creator: str, group: int, element: int, value: float, name: str | None
+):
+    """By name, as those of views; tried in test_nm.py with others."""
+    volume = torch.rand(GRID.shape)
+    write_nm(tmp_path / "v.dcm", volume, GRID)
+    dataset = pydicom.dcmread(tmp_path / "v.dcm")
+    dataset.private_block(group, creator, create=True).add_new(element, "FD", value)
+    dataset.save_as(tmp_path / "v.dcm")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert torch.allclose(read_nm_volume(tmp_path / "v.dcm").volume, volume, atol=1e-4)
+    assert [name is not None and name in str(one.message) for one in caught] == [True] * bool(name)

@@ -1,8 +1,11 @@
 """The attributes of DICOM NM's views that change counts or places. Requires pydicom."""
 
 import warnings
+from typing import Any
 
-from mvrecon.core.files.checks import Refused, shown
+import numpy as np
+
+from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.core.files.keys import Key, warn_of_unknown
 from mvrecon.data.dicom_image import ONE_FILE, DicomImage, same
 
@@ -27,8 +30,9 @@ OTHERWISE = {"TRANSMISSION", "RECON", "WHOLE"}
 DIFFER = {
     "TableTraverse": "which the cameras must have",
     "TableHeight": "which the cameras must have",
-    "TimeSlotTime": "for which the counts of its frames are not corrected",
 }
+#: Difference of the times of slots in ms that is rounding, as of 857 ms in 4 slots.
+ROUNDED_MS = 1.0
 #: Attributes of measured views besides `mvrecon.data.dicom_image.KEYS`.
 KEYS = (
     Key("Modality", "refused", "counts of a gamma camera", ("NM",)),
@@ -102,7 +106,8 @@ KEYS = (
         "with the widths_kev of a scatter estimate",
     ),
     Key("ZoomFactor", "compared", "of the detectors, which have one PixelSpacing"),
-    Key(", ".join(DIFFER), "compared", "of rotations, or of time slots; warned of"),
+    Key(", ".join(DIFFER), "compared", "of rotations; warned of"),
+    Key("TimeSlotTime", "compared", "with each other and FrameTime; warned of"),
     Key("CountsAccumulated, FrameReferenceTime, HighRRValue, LowRRValue", "ignored", "statistics"),
     Key(
         "ZoomCenter, CenterOfRotationOffset, TypeOfDetectorMotion, FocalDistance, XFocusCenter, "
@@ -148,4 +153,23 @@ def check_alike(image: DicomImage) -> None:
                 f"{image.path}: has several values of {name}, {values[0]} and {other[0]}, {need}",
                 stacklevel=3,
             )
+    with file_errors(image.path, "describes its time slots wrongly"):
+        intervals = [one for items in image.anywhere("DataInformationSequence") for one in items]
+        times = max(map(_slot_times, intervals), key=np.ptp, default=[0.0])
+    if np.ptp(times) > ROUNDED_MS:
+        warnings.warn(
+            f"{image.path}: has several values of TimeSlotTime, or another FrameTime, in one R-R "
+            f"interval, {min(times):g} to {max(times):g} ms, for which the counts of its frames "
+            f"are not corrected",
+            stacklevel=3,
+        )
     warn_of_unknown(image.path, image.private())
+
+
+def _slot_times(interval: Any) -> list[float]:
+    """Durations in ms of an item of DataInformationSequence: of its slots, and their nominal one; 0
+    of none.
+    """
+    slots = interval.get("TimeSlotInformationSequence") or []
+    stated = [interval.get("FrameTime"), *(slot.get("TimeSlotTime") for slot in slots)]
+    return [float(time) for time in stated if time not in (None, "")] or [0.0]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import Refused, check_file, file_errors, io_library, shown
-from mvrecon.core.files.keys import Key
+from mvrecon.core.files.keys import Key, warn_of_unknown
 from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.data.dicom import RAS
 from mvrecon.data.dicom_image import DicomImage, finite, same
@@ -217,14 +217,19 @@ def open_nm_volume(path: Path) -> tuple[Slabs, Grid]:
         raise Refused(f"{path}: expected the modality NM, got {modality}")
     count, (rows, columns) = image.frames, image.shape
     slices = frame_numbers(image, "SliceVector")
+    if image.value("SliceVector") is not None:
+        for name in (*TIME, *VIEW, WINDOW):
+            if len(found := set(frame_numbers(image, name))) > 1:
+                raise Refused(
+                    f"{path}: expected one volume, got {len(found)} by {name}; write a file for "
+                    f"each"
+                )
     if image.value("SliceVector") is None or sorted(slices) != list(range(1, count + 1)):
         raise Refused(
             f"{path}: expected the slices of one volume, each once in SliceVector, got "
             f"{len(set(slices))} of {count}; read_nm reads measured views"
         )
-    for name in (*TIME, *VIEW, WINDOW):
-        if len(found := set(frame_numbers(image, name))) > 1:
-            raise Refused(f"{path}: expected one volume, got {len(found)} by {name}")
+    warn_of_unknown(path, image.private())
     with file_errors(path, "has no position, direction or distance of its slices"):
         corner = _place(image, "ImagePositionPatient", 3)
         axes = _place(image, "ImageOrientationPatient", 6).reshape(2, 3)
