@@ -39,25 +39,30 @@ BEAM = (
 ).split()
 #: Changes of the table's place from the first frame on, a number for each frame.
 STEPS = ["TableVerticalIncrement", "TableLateralIncrement", "TableLongitudinalIncrement"]
-#: Attributes of DICOM projections that say where a camera is, or move the object; the last three
-#: lines are of DICOM-CT-PD.
-CAMERA_PLACES = [
+#: Attributes of DICOM projections that say where a camera is; those from DetectorCentralElement on
+#: are of DICOM-CT-PD.
+CAMERA_PLACES = (
+    "DistanceSourceToDetector DistanceSourceToIsocenter "
+    "DistanceReceptorPlaneToDetectorHousing RTImageSID RadiationMachineSAD "
+    "PositionOfIsocenterProjection PlaneIdentification DetectorPrimaryAngle "
+    "DetectorSecondaryAngle PositionerIsocenterDetectorRotationAngle DetectorCentralElement "
+    "ConstantRadialDistance DetectorFocalCenterAxialPosition "
+    "DetectorFocalCenterRadialDistance SourceAngularPositionShift SourceAxialPositionShift "
+    "SourceRadialDistanceShift"
+).split()
+#: Attributes that say where the object is, or move it; a flat field has none.
+OBJECT_PLACES = [
     *(
-        "DistanceSourceToDetector DistanceSourceToPatient DistanceSourceToIsocenter "
-        "DistanceSourceToEntrance DistanceSourceToSupport DistanceObjectToTableTop "
-        "DistanceReceptorPlaneToDetectorHousing RTImageSID RadiationMachineSAD IsocenterPosition "
-        "PositionOfIsocenterProjection PlaneIdentification DetectorPrimaryAngle "
-        "DetectorSecondaryAngle PositionerIsocenterDetectorRotationAngle PatientPosition "
-        "PatientSupportAngle TableHeight TableTraverse TableAngle TablePosition "
-        "TableXPositionToIsocenter TableYPositionToIsocenter TableZPositionToIsocenter "
-        "TableHorizontalRotationAngle TableHeadTiltAngle TableCradleTiltAngle "
-        "TableTopVerticalPosition TableTopLongitudinalPosition TableTopLateralPosition "
-        "TableTopEccentricAngle TableTopPitchAngle TableTopRollAngle "
-        "BreastSupportXPositionToIsocenter BreastSupportYPositionToIsocenter "
-        "BreastSupportZPositionToIsocenter BreastSupportIsocenterPrimaryAngle "
-        "BreastSupportIsocenterSecondaryAngle DetectorCentralElement ConstantRadialDistance "
-        "DetectorFocalCenterAxialPosition DetectorFocalCenterRadialDistance "
-        "SourceAngularPositionShift SourceAxialPositionShift SourceRadialDistanceShift"
+        "DistanceSourceToPatient DistanceSourceToEntrance DistanceSourceToSupport "
+        "DistanceObjectToTableTop IsocenterPosition PatientPosition PatientSupportAngle "
+        "TableHeight "
+        "TableTraverse TableAngle TablePosition TableXPositionToIsocenter "
+        "TableYPositionToIsocenter TableZPositionToIsocenter TableHorizontalRotationAngle "
+        "TableHeadTiltAngle TableCradleTiltAngle TableTopVerticalPosition "
+        "TableTopLongitudinalPosition TableTopLateralPosition TableTopEccentricAngle "
+        "TableTopPitchAngle TableTopRollAngle BreastSupportXPositionToIsocenter "
+        "BreastSupportYPositionToIsocenter BreastSupportZPositionToIsocenter "
+        "BreastSupportIsocenterPrimaryAngle BreastSupportIsocenterSecondaryAngle"
     ).split(),
     *STEPS,
 ]
@@ -82,7 +87,7 @@ NO_PROJECTIONS = {
     },
 }
 #: All that are compared between views with a warning.
-COMPARED = (*exposures.DICOM, *BEAM, *CAMERA_PLACES)
+COMPARED = (*exposures.DICOM, *BEAM, *CAMERA_PLACES, *OBJECT_PLACES)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
     Key(
@@ -174,7 +179,12 @@ DICOM_KEYS = (
     Key("DarkCurrentSequence, GainCorrectionReferenceSequence", "ignored", "views.dark and flat"),
     Key("BadPixelImage", "ignored", "views.bad_pixels"),
     Key("CollimatorShape, CollimatorShapeSequence", "ignored", "pixels behind it are measured"),
-    Key(", ".join(CAMERA_PLACES), "compared", "of all views; warned of, as the camera decides"),
+    Key(
+        ", ".join(CAMERA_PLACES),
+        "compared",
+        "of views and flat fields; warned of, as the camera decides",
+    ),
+    Key(", ".join(OBJECT_PLACES), "compared", "of all views; warned of, as the camera decides"),
     Key(
         "PositionerPrimaryAngle, PositionerSecondaryAngle, PositionerPrimaryAngleIncrement, "
         "PositionerSecondaryAngleIncrement, PositionerIsocenterPrimaryAngle, "

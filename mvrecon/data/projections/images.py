@@ -22,6 +22,7 @@ from mvrecon.data.projections.dicom_views import (
     ALIKE,
     CAMERA_PLACES,
     COMPARED,
+    OBJECT_PLACES,
     dicom_header,
     dicom_pages,
 )
@@ -89,10 +90,12 @@ class ImageFiles(ProjectionStack):
             own = [text for head in headers for text in head.stated.get(name, [""] * head.pages)]
             self.stated[name] = [own[k] for k in order]
         folder = files[0].parent
-        places = {name: self.stated[name] for name in CAMERA_PLACES}
+        places = {name: self.stated[name] for name in (*CAMERA_PLACES, *OBJECT_PLACES)}
         light = {name: texts for name, texts in self.stated.items() if name not in places}
         exposures.warn_of_several(folder, light)
         exposures.warn_of_several(folder, places, "which the camera must have")
+        for name in OBJECT_PLACES:
+            del self.stated[name]  # a flat field is taken without the object
         self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm = headers[0].pixel_mm
         self.unknown = [name for head in headers for name in head.unknown]

@@ -122,6 +122,33 @@ def test_a_set_has_one_warning_of_places_and_one_of_light(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "other", "counts"),
+    [
+        ("TableHeight", 200.0, False),
+        ("TableTraverse", 500.0, False),
+        ("TableTopVerticalPosition", 0.0, False),
+        ("PatientPosition", "HFP", False),
+        ("DistanceSourceToPatient", 0.0, False),
+        ("TableVerticalIncrement", 9.0, False),
+        ("DistanceSourceToDetector", 1200.0, True),
+        ("RTImageSID", 1200.0, True),
+        ("DetectorPrimaryAngle", 9.0, True),
+    ],
+)
+def test_places_of_the_object_are_not_those_of_a_flat_field(name, other, counts, tmp_path):
+    """It is taken without the object; how far its source is from the detector is compared."""
+    first = "HFS" if name == "PatientPosition" else 100.0
+    views(tmp_path, **{name: first})
+    flat = tmp_path / "flat.dcm"
+    dicom_image(flat, grey()[0] * 0 + 60_000, Modality="XA", **{name: other})
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        opened(tmp_path, flat=str(flat), find_bad_pixels=False)
+    texts = [str(one.message) for one in caught if one.category is UserWarning]
+    assert [name in text for text in texts] == [True] * counts
+
+
+@pytest.mark.parametrize(
     ("names", "way"),
     [
         ("ExposureTime XRayTubeCurrent", "ExposureTime*XRayTubeCurrent"),
