@@ -71,6 +71,8 @@ ORDER = [
     *("FrameAcquisitionNumber", "FrameAcquisitionDateTime", "FrameReferenceDateTime"),
     *("TemporalPositionIndex", "DimensionIndexValues"),
 ]
+#: Attributes by which views in files of their own were acquired: a number, and times.
+ACQUIRED = ("AcquisitionNumber", "AcquisitionDateTime", "AcquisitionDate", "AcquisitionTime")
 #: Rows and columns of the detector in DICOM-CT-PD, and the sizes of a pixel along these.
 PIXELS = ("NumberofDetectorRows", "NumberofDetectorColumns")
 PITCHES = ("DetectorElementAxialSpacing", "DetectorElementTransverseSpacing")
@@ -169,6 +171,7 @@ DICOM_KEYS = (
     Key("WaterAttenuationCoefficient", "ignored", "of the Hounsfield units of a reconstruction"),
     Key("InstanceNumber", "applied", "order of the views in files of their own"),
     Key(", ".join(ORDER), "compared", "with the order of the frames"),
+    Key(", ".join(ACQUIRED), "compared", "with the order by InstanceNumber; warned of"),
     Key(
         "PixelSpacing, ImagePlanePixelSpacing, ObjectPixelSpacingInCenterOfBeam",
         "ignored",

@@ -9,8 +9,9 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
-from itertools import groupby, islice
+from itertools import groupby, islice, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from mvrecon.data.dicom_image import DICOM, DicomImage, dicom_file, same
 from mvrecon.data.projections import exposures, rtk_images
 from mvrecon.data.projections.descriptions import path_in_set
 from mvrecon.data.projections.dicom_views import (
+    ACQUIRED,
     ALIKE,
     CAMERA_PLACES,
     COMPARED,
@@ -165,7 +167,8 @@ def view_files(
         fields: files of dark and flat fields, which are excluded.
 
     Warns:
-        UserWarning: DICOM images without InstanceNumbers, or with equal ones; see `ordered`.
+        UserWarning: DICOM images without InstanceNumbers, with equal ones, or acquired in another
+            order; see `ordered`.
 
     Raises:
         Refused: no image, too many, or of several formats; DICOM images of several series, or only
@@ -234,13 +237,16 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     all equal.
     """
     numbers: dict[Path, int | None] = {}
+    acquired: dict[Path, tuple[Any, ...]] = {}
     series = set()
     for file in files:
-        with file_errors(file, "has an InstanceNumber that cannot be read"):
+        with file_errors(file, "has an InstanceNumber or AcquisitionNumber that cannot be read"):
             dataset = DicomImage(file).dataset
             number = dataset.get("InstanceNumber")
             numbers[file] = None if number is None else int(number)
             series.add(dataset.get("SeriesInstanceUID"))
+            first, *times = ("" if v is None else str(v) for v in map(dataset.get, ACQUIRED))
+            acquired[file] = first and int(first), times[0] or times[1] + times[2]
     folder = files[0].parent
     if 1 < len(series) < len(files):  # some detectors store each exposure as its own series
         raise Refused(
@@ -265,6 +271,14 @@ def _by_instance(files: Sequence[Path], gaps: bool) -> list[Path]:
     in_order = sorted(known, key=lambda file: known[file])
     if not gaps:
         check_steps(folder, [[Decimal(known[file])] for file in in_order])
+    for what, one in (("AcquisitionNumber", 0), ("acquisition time", 1)):
+        stated = [acquired[file][one] for file in in_order]
+        if "" not in stated and any(later < earlier for earlier, later in pairwise(stated)):
+            warnings.warn(
+                f"{folder}: DICOM projections are in the order of InstanceNumber, but not in that "
+                f"of their {what}; are the cameras in this order?",
+                stacklevel=2,
+            )
     return in_order
 
 

@@ -224,6 +224,37 @@ FRAMES = {
 }
 
 
+@pytest.mark.parametrize(
+    ("stated", "other"),
+    [
+        ({"AcquisitionNumber": lambda k: COUNT - 1 - k}, True),
+        ({"AcquisitionTime": lambda k: f"1200{59 - k}"}, True),
+        ({"AcquisitionDateTime": lambda k: f"2024010112{59 - k}"}, True),
+        ({"AcquisitionDate": lambda k: f"2024010{9 - k}", "AcquisitionTime": lambda k: "12"}, True),
+        ({"AcquisitionNumber": lambda k: 3}, False),
+        ({"AcquisitionNumber": lambda k: None if k else 3}, False),
+        (
+            {  # over midnight
+                "AcquisitionDate": lambda k: f"2024010{1 + k // 2}",
+                "AcquisitionTime": lambda k: f"{(23 + k // 2) % 24:02}0{k}00.5",
+            },
+            False,
+        ),
+    ],
+)
+def test_views_acquired_in_another_order_are_warned_of(stated, other, tmp_path):
+    """Files are in the order of InstanceNumber; equal numbers and times, or those of some files
+    alone, are of no order.
+    """
+
+    def change(dataset, k):
+        for name, value in stated.items():
+            setattr(dataset, name, value(k))
+
+    texts = warned(views(tmp_path, change))
+    assert ["InstanceNumber" in text for text in texts] == [True] * other
+
+
 @pytest.mark.parametrize("name", FRAMES)
 def test_frames_in_another_order_than_they_state_are_refused(name, tmp_path):
     for values in (FRAMES[name], [*FRAMES[name][1:], FRAMES[name][0]]):
