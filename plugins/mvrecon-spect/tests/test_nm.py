@@ -138,17 +138,14 @@ def test_a_gated_study_is_read_slot_by_slot(tmp_path: Path):
         (2, 1, 0.0, 0.2),
         (2, 2, 0.2, 0.2),
     ]
-    assert [one.counts[0][0, 0, 1, 0, 0].item() for one in studies] == [
-        211,
-        212,
-        213,
-        214,
-        221,
-        222,
-    ]
+    counts = [one.counts[0][0, 0, 1, 0, 0].item() for one in studies]
+    assert counts == [211, 212, 213, 214, 221, 222]
     # without the times of the slots the frames are the same
     bare = in_time(tmp_path / "b.dcm", vectors)
     assert [frame.start_s for frame, _ in read_frames(bare)] == [None] * 6
+    gate.CardiacFramingType = "BACK"  # from the next R wave on
+    back = in_time(tmp_path / "c.dcm", vectors, GatedInformationSequence=[gate])
+    assert [frame.start_s for frame, _ in read_frames(back)] == [None] * 6
 
 
 def test_a_tomogram_is_a_single_frame(tmp_path: Path):

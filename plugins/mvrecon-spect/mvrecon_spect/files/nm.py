@@ -51,7 +51,7 @@ class View(NamedTuple):
 class Frame(NamedTuple):
     """Time of a frame of a dynamic or gated study: phase and time slice, R-R interval and time
     slot, each from 1; start and duration in s from the beginning of the study or from the R wave,
-    None if the file does not contain them.
+    None if the file does not contain them, or frames backward from the R wave.
     """
 
     phase: int
@@ -383,7 +383,8 @@ def _frame(dataset: Any, moment: Moment, moments: Sequence[Moment]) -> Frame:
     step = _number("FrameTime", _item(gate, "DataInformationSequence", interval))
     if step is None:
         return Frame(*moment, None, None)
-    return Frame(*moment, (slot - 1) * step / 1000, step / 1000)
+    back = gate.get("CardiacFramingType") == "BACK"  # slots end with the next R wave
+    return Frame(*moment, None if back else (slot - 1) * step / 1000, step / 1000)
 
 
 def _seconds(item: Any) -> float | None:

@@ -92,6 +92,9 @@ KEYS = (
         "unknown of gated frames; 0: not stated",
     ),
     Key("FrameTime", "applied", "of the one item of GatedInformationSequence"),
+    Key(
+        "CardiacFramingType", "applied", "of slots framed BACK from an R wave the start is unknown"
+    ),
     *(Key(name, "applied") for name in ("PhaseDelay", "PauseBetweenFrames")),
     Key("NumberOfFramesInPhase", "applied"),
     Key("PixelSpacing", "compared", "with the cameras' pixel size, by paired"),
