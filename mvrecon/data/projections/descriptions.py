@@ -100,7 +100,11 @@ NAMED = re.compile(
     r"([^\"'<>]{1,200})"
 )
 #: Names of scales of the display, of stages and lenses; and units of other things than values.
-OF_DISPLAY = re.compile("spatial|stage|zoom|magnif|auto.?scale|display|look.?up", re.IGNORECASE)
+OF_DISPLAY = re.compile(
+    "spatial|stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|"
+    r"(?<![a-z])(date|time)\b",
+    re.IGNORECASE,
+)
 OTHER_UNITS = {
     *MILLIMETRES,
     *("pixel", "pixels", "px", "inch", "in", "s", "sec", "ms", "us", "deg", "degrees", "rad"),
