@@ -113,6 +113,8 @@ TEXTS = {
     "<a><slope>0.5</slope><b offset='3'/></a>": ["b offset", "slope"],
     '<a><Item name="scale">3</Item><p name="gain" value="4"/></a>': ["gain", "scale"],
     "unit=mm": [],
+    "Scale bar: 100 um\nCalibration date: 2020-05-01\nGain: 1": [],
+    "Date: 2020-05-01\nPixel scale: 2\nUpdated gain: 3": ["Pixel scale", "Updated gain"],
     "Units: optical density": ["Units"],
     "ImageJ=1.54f\nunit=micron\nvunit=Gray Value\nmin=0.0": [],
     "ImageJ=1.54f\ngain=3": ["gain"],
@@ -282,6 +284,44 @@ def test_a_detector_that_depends_on_a_rotation_elsewhere_is_warned_of(angle, tmp
         warnings.simplefilter("always")
         assert opened(path).n_views == (KEYS == 0).sum()
     assert any("detector is turned" in str(one.message) for one in caught) is (angle != 0)
+
+
+def frames_in(path, values, unit, name="units"):
+    """Frames of another program, whose unit is of this attribute."""
+    with h5py.File(path, "w") as file:
+        file.create_dataset("raw", data=values).attrs[name] = unit
+    return path
+
+
+@pytest.mark.parametrize("name", ["units", "unit"])
+@pytest.mark.parametrize("unit", ["", "counts", "ADU", "counts/s", "1/s", "analog-digital units"])
+def test_units_of_intensities_are_read(unit, name, tmp_path):
+    """Tried as well: a.u., photons, e-, V, grey value."""
+    assert named(frames_in(tmp_path / "a.h5", grey(), unit, name), dataset="raw", **GIVEN) == []
+
+
+@pytest.mark.parametrize(
+    "unit", ["-ln(I/I0)", "absorbance", "log10(I0/I)", "1/m", "cm^-1", "optical density"]
+)
+def test_units_of_line_integrals_are_refused_as_intensities(unit, tmp_path):
+    """Also without flat fields in the file: the logarithm would be taken twice."""
+    path = frames_in(tmp_path / "a.h5", grey().astype("f4"), unit)
+    for options in ({"kind": "intensities", **GIVEN}, {"kind": "counts"}):
+        with pytest.raises(Refused, match="expected units of"):
+            opened(path, dataset="raw", **options)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [
+        *((unit, False) for unit in ("", "1", "-ln(I/I0)", "attenuation", "dimensionless")),
+        *((unit, True) for unit in ("log10(I0/I)", "optical density", "1/cm", "%", "mm", "counts")),
+    ],
+)
+def test_units_of_line_integrals_that_need_a_factor_are_named(unit, factor, tmp_path):
+    path = frames_in(tmp_path / "a.h5", grey().astype("f4") / 60_000, unit)
+    expected = [f"units={unit}"] if factor else []
+    assert named(path, dataset="raw", kind="integrals") == expected
 
 
 @pytest.mark.parametrize("unit", ["ADU", "counts/s", "mm", "", "arbitrary units of light"])
