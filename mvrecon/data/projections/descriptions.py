@@ -89,9 +89,10 @@ OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
-#: Entries of any text: a name, `=`, `:` or a tabulator, and a word or a list; and elements of XML.
+#: Entries of any text: a name, `=`, `:`, a tabulator or a blank before a number, and a word or a
+#: list; and elements of XML.
 ENTRY = re.compile(
-    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)[\"']?[ ]*[:=\t][ \t]*[\"']?"
+    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)(?:[\"']?[ ]*[:=\t][ \t]*[\"']?|[ ]+(?=[-+]?\.?\d))"
     r"(?=(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+))"
 )
 ELEMENT = re.compile(r"<([\w:.-]{1,60})(?:\s[^<>]{0,200})?>\s*([^<>\s][^<>]{0,200})</")

@@ -103,6 +103,8 @@ def test_a_tag_of_one_page_and_of_a_cameras_exif_is_named(tmp_path):
 TEXTS = {
     "a scan of a shell, 0.5 mm of aluminium": [],
     "slope=1\nintercept=0.0": [],
+    "normalised, intensity scale 0.001 offset 0": ["intensity scale"],
+    "scan 12 of 3 bones, gain 1, 0.5 mm of aluminium\nscale 1 offset 0.0": [],
     "date=1\nslope=2": ["slope"],
     "Rescale Slope: 2\nRescale Intercept: -1000": ["Rescale Intercept", "Rescale Slope"],
     "gain=1 offset=5": ["offset"],
