@@ -135,7 +135,8 @@ KEYS = (
 #: Words of fields beside the frames that a warning names, and their values that change nothing.
 FIELD_EFFECTS = {
     **EFFECTS,
-    "flip|mirror|transpos|invert|swap|polar_angle": 0,
+    "flip|mirror|transpos|invert|swap|polar_angle|tilt|(image|frame|detector|camera).?rotat": 0,
+    "(correct|subtract|normali[sz])ed|distort": 0,
     "time_of_flight": None,
 }
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
@@ -390,6 +391,11 @@ class _Layout(NamedTuple):
         self._warn_of_moves(keys, pixel)
         limits = limits_of(self.detector, frames, keys)
         unknown = [*self._unknown_fields(), *(n for p in angles for n in unknown_attributes(p))]
+        unknown += [
+            f"{name}@units={field.units}"
+            for name, field in fields.items()
+            if len({field.units, frames.units} - {""}) > 1
+        ]
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
 
     def _unknown_fields(self) -> list[str]:

@@ -251,6 +251,15 @@ FIELDS = {
     ),
     "scales": ({"gain": 2.0, "black_offset": 100}, ["black_offset", "gain"]),
     "geometry": ({"polar_angle": 12.0, "flip_rows": True}, ["flip_rows", "polar_angle"]),
+    "turned": ({"image_rotation": 90, "tilt_angle": 2.0}, ["image_rotation", "tilt_angle"]),
+    "corrections": (
+        {"background_subtracted": True, "normalised": 1, "distortion": np.ones((2, 2))},
+        ["background_subtracted", "distortion", "normalised"],
+    ),
+    "what detectors apply": (
+        {"flatfield_applied": True, "countrate_correction_applied": True, "dark_corrected": 0},
+        [],
+    ),
     "another axis": ({"time_of_flight": np.arange(9.0)}, ["time_of_flight"]),
 }
 
@@ -324,6 +333,15 @@ def test_units_of_line_integrals_that_need_a_factor_are_named(unit, factor, tmp_
     path = frames_in(tmp_path / "a.h5", grey().astype("f4") / 60_000, unit)
     expected = [f"units={unit}"] if factor else []
     assert named(path, dataset="raw", kind="integrals") == expected
+
+
+@pytest.mark.parametrize(("unit", "names"), [("counts", []), ("counts/s", ["flat@units=counts/s"])])
+def test_fields_in_other_units_than_the_views_are_named(unit, names, tmp_path):
+    path = exchange(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        file["exchange/data"].attrs["units"] = "counts"
+        file["exchange/data_white"].attrs["units"] = unit
+    assert named(path) == names
 
 
 @pytest.mark.parametrize("unit", ["ADU", "counts/s", "mm", "", "arbitrary units of light"])
