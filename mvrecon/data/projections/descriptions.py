@@ -89,9 +89,10 @@ OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
-#: Entries of any text: a name, `=`, `:` or a tabulator, and a word or a list; and elements of XML.
+#: Entries of any text: a name, `=`, `:`, a tabulator or a blank before a number, and a word or a
+#: list; and elements of XML.
 ENTRY = re.compile(
-    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)[\"']?[ ]*[:=\t][ \t]*[\"']?"
+    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)(?:[\"']?[ ]*[:=\t][ \t]*[\"']?|[ ]+(?=[-+]?\.?\d))"
     r"(?=(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+))"
 )
 ELEMENT = re.compile(r"<([\w:.-]{1,60})(?:\s[^<>]{0,200})?>\s*([^<>\s][^<>]{0,200})</")
@@ -100,7 +101,11 @@ NAMED = re.compile(
     r"([^\"'<>]{1,200})"
 )
 #: Names of scales of the display, of stages and lenses; and units of other things than values.
-OF_DISPLAY = re.compile("spatial|stage|zoom|magnif|auto.?scale|display|look.?up", re.IGNORECASE)
+OF_DISPLAY = re.compile(
+    "spatial|stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|"
+    r"(?<![a-z])(date|time)\b",
+    re.IGNORECASE,
+)
 OTHER_UNITS = {
     *MILLIMETRES,
     *("pixel", "pixels", "px", "inch", "in", "s", "sec", "ms", "us", "deg", "degrees", "rad"),

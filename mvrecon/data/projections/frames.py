@@ -19,6 +19,7 @@ from mvrecon.data.linked import (
     check_around,
     followed,
     numbers_at,
+    texts_at,
     unknown_attributes,
 )
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
@@ -26,6 +27,8 @@ from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, ope
 
 #: Attributes of frames by which areaDetector states their part of the detector.
 REGION = ("NDArrayDimOffset", "NDArrayDimBinning", "NDArrayDimReverse")
+#: Attributes by which files state units of frames.
+UNITS = ("units", "unit")
 #: `H5S_SEL_ALL` of HDF5: a whole data set.
 SELECTS_ALL = 3
 
@@ -60,7 +63,7 @@ class Frames:
                 raise Refused(f"{place}: expected numbers [m v u] of frames, got {got}")
             self.shape = (1,) * (3 - stored.ndim) + stored.shape
             self.dtype = stored.dtype
-            check_attributes(place.path, stored, ("units", *REGION))
+            check_attributes(place.path, stored, (*UNITS, *REGION))
             check_around(place)
             if not stored.is_virtual:
                 self.parts = [Segment(place, 0, self.shape[0])]
@@ -75,6 +78,8 @@ class Frames:
         self.region = {name: self._common(name) for name in REGION}
         places = dict.fromkeys([place, *(part.place for part in self.parts)])
         self.unknown = [name for one in places for name in unknown_attributes(one)]
+        units = {text for name in UNITS for text in texts_at([*places], name).values()}
+        self.units = " or ".join(sorted(units - {""}))
 
     def _common(self, name: str) -> np.ndarray | None:
         """An attribute of the data set, and of those of its parts; None if they have none."""
@@ -94,7 +99,7 @@ class Frames:
         if found is not None:
             with opened(found.path) as file:
                 stored = dataset_in(found.path, file, found.name)
-                check_attributes(found.path, stored, ("units", *REGION))
+                check_attributes(found.path, stored, (*UNITS, *REGION))
                 shape = stored.shape
             check_around(found)
             start, end = source.vspace.get_select_bounds()
@@ -180,6 +185,7 @@ class FrameViews(ProjectionStack):
         self.fields, self.rig, self.detector = fields or {}, rig, frames.region
         self.stated = {name: texts[numbers].tolist() for name, texts in (stated or {}).items()}
         self._marked, self._top, self.unknown = marked, top, [*frames.unknown, *unknown]
+        self.units = frames.units
         if "flat" in self.fields:
             self.kind = "intensities"
 

@@ -63,8 +63,14 @@ KEYS = (
     Key(
         "units",
         "refused",
-        "of angles and lengths; of frames with flat fields, those of line integrals",
+        "of angles and lengths",
         ("degrees", "radians", "m", "mm", "um", "..."),
+    ),
+    Key(
+        "data@units, data@unit",
+        "compared",
+        "with views.kind: those of line integrals are refused for others, and of line integrals a "
+        "warning names those that need a factor",
     ),
     Key(
         "axes",
@@ -129,13 +135,12 @@ KEYS = (
 #: Words of fields beside the frames that a warning names, and their values that change nothing.
 FIELD_EFFECTS = {
     **EFFECTS,
-    "flip|mirror|transpos|invert|swap|polar_angle": 0,
+    "flip|mirror|transpos|invert|swap|polar_angle|tilt|(image|frame|detector|camera).?rotat": 0,
+    "(correct|subtract|normali[sz])ed|distort": 0,
     "time_of_flight": None,
 }
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
-#: Units of line integrals.
-LOGARITHMS = re.compile(r"absor|optical.?dens|^od$|attenuation|^ln|log|1/|\^-1", re.IGNORECASE)
 #: Pixels by which a sample may move between views.
 MAX_MOVE_PX = 0.1
 
@@ -375,12 +380,6 @@ class _Layout(NamedTuple):
                 n: of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
             }
             fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats)
-        unit = texts_at([self.frames], "units").get(self.frames, "")
-        if "flat" in fields and LOGARITHMS.search(unit):
-            raise Refused(
-                f"{self.frames}: expected units of intensities beside flat fields, got "
-                f"{shown(unit)}; say views.dataset={self.frames.name} of a file without them"
-            )
         views = np.flatnonzero(keys == VIEW)
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
         angles = [] if self.angles is None else [self.angles]
@@ -392,6 +391,11 @@ class _Layout(NamedTuple):
         self._warn_of_moves(keys, pixel)
         limits = limits_of(self.detector, frames, keys)
         unknown = [*self._unknown_fields(), *(n for p in angles for n in unknown_attributes(p))]
+        unknown += [
+            f"{name}@units={field.units}"
+            for name, field in fields.items()
+            if len({field.units, frames.units} - {""}) > 1
+        ]
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
 
     def _unknown_fields(self) -> list[str]:

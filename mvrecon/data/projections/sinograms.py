@@ -12,7 +12,7 @@ from mvrecon.data.projections.stack import READ_PIXELS, ProjectionStack
 #: Attributes of a stack that hold for all views together.
 OF_ALL = (
     *("kind", "unit", "dose", "own_unit", "duration_s", "total_s", "began", "window_kev"),
-    *("attenuated", "detector", "rig", "mirrored", "scan", "unknown"),
+    *("attenuated", "detector", "rig", "mirrored", "scan", "unknown", "units"),
 )
 
 

@@ -126,6 +126,8 @@ class ProjectionStack(ABC):
     stated: Mapping[str, Sequence[str]] = {}
     #: What the files state of the detector, by name, which fields have in common with their views.
     detector: Mapping[str, Any] = {}
+    #: Units that HDF5 of another program states for the pixels; they must suit their kind.
+    units: str = ""
     #: Keys of the files that their reader does not know, and that may change values or geometry.
     unknown: Sequence[str] = ()
     #: Name and options of the camera that the file states, those of the detector without pixels;

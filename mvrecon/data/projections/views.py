@@ -1,6 +1,7 @@
 """Measured views as line integrals, corrected when read, on a region of the detector."""
 
 import math
+import re
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -14,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import Refused
+from mvrecon.core.files.checks import Refused, shown
 from mvrecon.core.files.keys import warn_of_unknown
 from mvrecon.core.machine import check_memory
 from mvrecon.data.projections.faults import (
@@ -42,6 +43,17 @@ from mvrecon.geometry.cameras.camera import Cameras
 
 #: Share of the pixels that views alone may show to be wrong.
 MAX_WRONG = 0.1
+#: Units of logarithms, and those of line integrals that need no factor: of another base, a length
+#: or a number of counts they would.
+LOGARITHMS = re.compile(
+    r"absor|optical.?dens|^od$|attenuation|\b(ln|log|lg)|1/ ?[cmnuµ]?m\b|\b[cmnuµ]?m ?\^?-1",
+    re.IGNORECASE,
+)
+INTEGRALS = re.compile(
+    r"|1|1/mm \* mm|none|(unit|dimension)less|a\.? ?u\.?|arb.*|.*\bln\b.*|(line )?integrals?|"
+    r"(linear )?attenuation|absorption|projections?",
+    re.IGNORECASE,
+)
 #: Line integrals below this are more than an imperfect flat field: 5 % brighter than it.
 NEGATIVE = -0.05
 #: Views before and after each that zingers of one or two rows are compared with.
@@ -92,7 +104,6 @@ class MeasuredViews:
             options.path, options.pattern, options.gaps, own, options.layout, **names
         )
         self.options, self.stack = options, stack
-        warn_of_unknown(stack.path, stack.unknown)
         self.region = Region(stack.shape, options.rows, options.columns, options.binning)
         whole = stack.dtype.kind != "f"
         if options.kind == "integrals" and whole:
@@ -108,6 +119,15 @@ class MeasuredViews:
                 f"pixels of {stack.dtype}, which may be either, as those that a file scales "
                 f"(kind=counts: emission), got none"
             )
+        if kind != "integrals" and LOGARITHMS.search(stack.units):
+            wanted = "intensities beside flat fields" if kind == "intensities" else kind
+            raise Refused(
+                f"{options.path}: expected units of {wanted}, got {shown(stack.units)}; if they "
+                f"are right, say kind=integrals (views.kind), and views.dataset=<name> of a file "
+                f"without flat fields"
+            )
+        other = kind == "integrals" and not INTEGRALS.fullmatch(stack.units)
+        warn_of_unknown(stack.path, [*stack.unknown, *[f"units={stack.units}"] * other])
         if kind == "counts" and options.linearise is not None:
             raise Refused(
                 f"{options.path}: expected line integrals or intensities for views.linearise, got "

@@ -509,7 +509,7 @@ HARMLESS = [
     "number of images/energy window := 4",
     "number of dimensions := 3",
     "Centre_of_rotation := Corrected",
-    "camera zoom factor := 1",
+    *("camera zoom factor := 1", "zoom := 1.0", "gantry tilt (deg) := 0", "image shift := 0 0"),
     "acquisition mode := stepped",
     "study duration (elapsed) sec : = 320",
     "!maximum pixel count : = 33",

@@ -174,6 +174,7 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
         **{"RotationDirection": "CW", "FlipHorizontal": "True", "AngularUnits": "rad"},
         **{"PixelBinning": 2, "HelixPitch": 10, "ZStep": 0.3, "ConveyorSpeed": 5},
         **{"ScanType": "Helical", "IncrementalAngle": -60, "StartAngle": 90},
+        **{"ReversedImages": "True", "DetectorBinning": "2x2"},
     }.items():
         with pytest.warns(UserWarning, match=f"know: {name.lower()}={value};"):
             nikon.read(xtekct(tmp_path, **{name: value}))
@@ -183,6 +184,7 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
     own |= {"FluxNormalisation": 0, "FramesPerProjection": 4, "Increment": 1, "OrderFFT": 3}
     own |= {"VirtualDetectorPixelsX": 6, "SrcToVirtualDetector": 400.0, "Blanking": 0}
     own |= {"AutomaticCentreOfRotationMaskRadius": 3.0, "OperatorID": "a", "OutputDigits": 4}
+    own |= {"DetectorName": "Varex", "DetectorBinning": 1}
     with warnings.catch_warnings(action="error"):
         for none in ("", "none", "NONE"):
             own |= {"AngleFile": none}

@@ -103,6 +103,8 @@ def test_a_tag_of_one_page_and_of_a_cameras_exif_is_named(tmp_path):
 TEXTS = {
     "a scan of a shell, 0.5 mm of aluminium": [],
     "slope=1\nintercept=0.0": [],
+    "normalised, intensity scale 0.001 offset 0": ["intensity scale"],
+    "scan 12 of 3 bones, gain 1, 0.5 mm of aluminium\nscale 1 offset 0.0": [],
     "date=1\nslope=2": ["slope"],
     "Rescale Slope: 2\nRescale Intercept: -1000": ["Rescale Intercept", "Rescale Slope"],
     "gain=1 offset=5": ["offset"],
@@ -113,6 +115,8 @@ TEXTS = {
     "<a><slope>0.5</slope><b offset='3'/></a>": ["b offset", "slope"],
     '<a><Item name="scale">3</Item><p name="gain" value="4"/></a>': ["gain", "scale"],
     "unit=mm": [],
+    "Scale bar: 100 um\nCalibration date: 2020-05-01\nGain: 1": [],
+    "Date: 2020-05-01\nPixel scale: 2\nUpdated gain: 3": ["Pixel scale", "Updated gain"],
     "Units: optical density": ["Units"],
     "ImageJ=1.54f\nunit=micron\nvunit=Gray Value\nmin=0.0": [],
     "ImageJ=1.54f\ngain=3": ["gain"],
@@ -247,6 +251,15 @@ FIELDS = {
     ),
     "scales": ({"gain": 2.0, "black_offset": 100}, ["black_offset", "gain"]),
     "geometry": ({"polar_angle": 12.0, "flip_rows": True}, ["flip_rows", "polar_angle"]),
+    "turned": ({"image_rotation": 90, "tilt_angle": 2.0}, ["image_rotation", "tilt_angle"]),
+    "corrections": (
+        {"background_subtracted": True, "normalised": 1, "distortion": np.ones((2, 2))},
+        ["background_subtracted", "distortion", "normalised"],
+    ),
+    "what detectors apply": (
+        {"flatfield_applied": True, "countrate_correction_applied": True, "dark_corrected": 0},
+        [],
+    ),
     "another axis": ({"time_of_flight": np.arange(9.0)}, ["time_of_flight"]),
 }
 
@@ -282,6 +295,53 @@ def test_a_detector_that_depends_on_a_rotation_elsewhere_is_warned_of(angle, tmp
         warnings.simplefilter("always")
         assert opened(path).n_views == (KEYS == 0).sum()
     assert any("detector is turned" in str(one.message) for one in caught) is (angle != 0)
+
+
+def frames_in(path, values, unit, name="units"):
+    """Frames of another program, whose unit is of this attribute."""
+    with h5py.File(path, "w") as file:
+        file.create_dataset("raw", data=values).attrs[name] = unit
+    return path
+
+
+@pytest.mark.parametrize("name", ["units", "unit"])
+@pytest.mark.parametrize("unit", ["", "counts", "ADU", "counts/s", "1/s", "analog-digital units"])
+def test_units_of_intensities_are_read(unit, name, tmp_path):
+    """Tried as well: a.u., photons, e-, V, grey value."""
+    assert named(frames_in(tmp_path / "a.h5", grey(), unit, name), dataset="raw", **GIVEN) == []
+
+
+@pytest.mark.parametrize(
+    "unit", ["-ln(I/I0)", "absorbance", "log10(I0/I)", "1/m", "cm^-1", "optical density"]
+)
+def test_units_of_line_integrals_are_refused_as_intensities(unit, tmp_path):
+    """Also without flat fields in the file: the logarithm would be taken twice."""
+    path = frames_in(tmp_path / "a.h5", grey().astype("f4"), unit)
+    for options in ({"kind": "intensities", **GIVEN}, {"kind": "counts"}):
+        with pytest.raises(Refused, match="expected units of"):
+            opened(path, dataset="raw", **options)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [
+        *((unit, False) for unit in ("", "1", "-ln(I/I0)", "attenuation", "dimensionless")),
+        *((unit, True) for unit in ("log10(I0/I)", "optical density", "1/cm", "%", "mm", "counts")),
+    ],
+)
+def test_units_of_line_integrals_that_need_a_factor_are_named(unit, factor, tmp_path):
+    path = frames_in(tmp_path / "a.h5", grey().astype("f4") / 60_000, unit)
+    expected = [f"units={unit}"] if factor else []
+    assert named(path, dataset="raw", kind="integrals") == expected
+
+
+@pytest.mark.parametrize(("unit", "names"), [("counts", []), ("counts/s", ["flat@units=counts/s"])])
+def test_fields_in_other_units_than_the_views_are_named(unit, names, tmp_path):
+    path = exchange(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        file["exchange/data"].attrs["units"] = "counts"
+        file["exchange/data_white"].attrs["units"] = unit
+    assert named(path) == names
 
 
 @pytest.mark.parametrize("unit", ["ADU", "counts/s", "mm", "", "arbitrary units of light"])

@@ -86,8 +86,9 @@ KNOWN = {name.lower() for key in KEYS for name in key.names}
 #: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
 NIKON_EFFECTS = {
     **EFFECTS,
-    "level|tilt|roll|pitch|yaw|shift|step|angle|increment|direction|clockwise|rotat|distort|binn|"
-    "object|detector|heli|spiral|conveyor|scan.?type": 0,
+    "level|tilt|roll|pitch|yaw|shift|step|angle|increment|direction|clockwise|rotat|revers|distort|"
+    "object|detector(?!.?(name|model|serial))|heli|spiral|conveyor|scan.?type": 0,
+    "binn": 1,
 }
 
 

@@ -253,7 +253,13 @@ EFFECT = re.compile(
 )
 #: Values of such a key that change nothing, by its words: 1 of slopes, 0 of offsets; see
 #: `mvrecon.core.files.keys.EFFECTS`.
-EFFECTS = {EFFECT.pattern: None, **keys.EFFECTS, r"\blog|\bpower|correct": None}
+EFFECTS = {
+    EFFECT.pattern: None,
+    **keys.EFFECTS,
+    "zoom|magnif|binning|mashing": 1,
+    r"tilt|\bshift|rotat|translat|invert|revers": 0,
+    r"\blog|\bpower|correct|number of": None,
+}
 #: Other spellings of known keys: American, Siemens', and (X)MedCon's of the group "NUD/".
 SPELLINGS = {
     "center": "centre",
