@@ -177,6 +177,11 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
     if axis != KEPT:
         size["offset_u"] = axis.uncertainty
+        if "tilt" in size:  # which the axis follows
+            turned = by._replace(tilt_degrees=by.tilt_degrees.clone())
+            turned.tilt_degrees[:, KINDS["tilt"].column] += size["tilt"]
+            change = conjugate_axis(misaligned(scan.cameras, turned), pixels, scan.grid)
+            size["offset_u"] = math.hypot(axis.uncertainty, change.offset)
         fit = fit._replace(kept=[name for name in fit.kept if name != "offset_u"])
     elif "offset_u" in free and "offset_u" not in fit.kept:
         pixels = (pixels / fit.gains[:, None, None].to(pixels)).to(device)

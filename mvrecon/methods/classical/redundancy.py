@@ -55,6 +55,10 @@ ASIDE = (0.81, 0.47, 0.35)
 #: Share of the lines at any one distance from the axis that are not measured, from which a warning
 #: is given: at the rim of a fan whose arc is 8 degrees short values are 2 % off.
 WARNED_MISSING = 0.01
+#: The same of all lines, where those missing are farther off than any that are measured: views cut
+#: an object that reaches there, which they warn of. A cube about the field of a square panel has
+#: 1 - cos of half the fan angle, 5 % of 18 degrees.
+WARNED_BEYOND = 0.05
 #: Streaks of a disc half as wide as the grid, root mean square over the grid's cylinder relative to
 #: that of the disc, by half a turn's number of directions in which its edge is measured; and from
 #: which on a warning is given. Measured: 2.9 / n of 2 directions to 4.3 / n of 12 and more, of a
@@ -159,7 +163,7 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
         )
     near = branches.measured & branches.near
     bridged = _Missing.of(branches, near, orbit, start, rim, offset)
-    if bridged.worst > WARNED_MISSING:
+    if bridged.worst > WARNED_MISSING or bridged.share > WARNED_BEYOND:
         warnings.warn(
             f"{bridged}; expect from these alone errors of several per cent on these lines, of "
             f"tens of per cent where more than 5% at one distance are missing, and of more if the "
@@ -516,7 +520,7 @@ class _Missing:
 
     Args:
         share: their share of all lines through it.
-        worst: greatest share of the lines at one distance from the axis.
+        worst: greatest share of the lines at one distance from the axis of which some are measured.
         where: where they are, in words.
         hole: whether no line at some distance from the axis is measured, but lines farther off are.
         radius: radius of the cylinder, in mm.
@@ -573,7 +577,7 @@ class _Missing:
         some = gone.any(dim=1) & ~everywhere
         seen = (through & ~gone).any(dim=1)
         hole = bool((everywhere & (seen.flip(0).cumsum(0).flip(0) > 0)).any())
-        worst = gone.double().mean(dim=1).max().item()
+        worst = (gone.double().mean(dim=1) * ~everywhere).max().item()
         return cls(share, worst, hole, _where(everywhere, some, gone, s, theta), radius)
 
 

@@ -2,6 +2,7 @@
 mesh for viewers without lines.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.rigid import unit
 from mvrecon.report.viz.images import Image, save_png
 
 if TYPE_CHECKING:
@@ -57,7 +59,7 @@ def picture(cameras: Cameras, grid: Grid | None = None) -> Image:
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    rig = cameras.to("cpu")
+    rig = _near(cameras.to("cpu"), grid)
     chosen = sorted({0, min(1, len(rig) - 1), *range(0, len(rig), max(1, len(rig) // DRAWN_VIEWS))})
     corners, starts = (part[chosen] for part in outlines(rig))
     edges = torch.empty(0, 2, 3).to(corners) if grid is None else box(grid)
@@ -183,7 +185,7 @@ def segments(cameras: Cameras, grid: Grid | None = None) -> dict[str, Segments]:
         cameras: the rig, about `DRAWN_LINES` of whose cameras are drawn.
         grid: grid whose box is drawn; none by default.
     """
-    rig = cameras.to("cpu")
+    rig = _near(cameras.to("cpu"), grid)
     chosen = sorted({0, *range(0, len(rig), max(1, len(rig) // DRAWN_LINES))})
     corners, starts = outlines(rig)
     arm = 0.02 * (corners.flatten(0, 1).amax(0) - corners.flatten(0, 1).amin(0)).max()
@@ -219,6 +221,22 @@ def mesh(parts: dict[str, Segments]) -> Mesh:
     faces = torch.tensor(sides) + 6 * torch.arange(len(ends))[:, None, None]
     colours = [torch.tensor(MESH_COLOURS[name]).expand(6 * len(s), 3) for name, s in parts.items()]
     return Mesh(vertices, torch.cat(colours), faces.reshape(-1, 3))
+
+
+def _near(rig: Cameras, grid: Grid | None) -> Cameras:
+    """Parallel beams without an end, drawn from the grid on as far as it and detectors are wide, to
+    scale with them; other rigs as they are.
+    """
+    if grid is None or not rig.parallel or rig.extent != "line":
+        return rig
+    rows, columns = rig.shape
+    panel = (rig.u * columns).norm(dim=1) + (rig.v * rows).norm(dim=1)
+    low, high = grid.corners().to(panel).aminmax(dim=0)
+    reach = panel.max() + (high - low).norm()
+    way = unit(rig.origin - rig.source)
+    beside = ((grid.centre.to(way) - rig.detector_centre) * way).sum(dim=1, keepdim=True) * way
+    middle = rig.origin + beside
+    return replace(rig, source=middle - reach * way, origin=middle + reach * way)
 
 
 def outlines(rig: Cameras) -> tuple[Float[Tensor, "m 4 3"], Float[Tensor, "m k 3"]]:

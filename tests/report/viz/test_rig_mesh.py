@@ -1,5 +1,6 @@
 """A rig as lines and rods: they lie where the rays, detectors and the grid are."""
 
+import pytest
 import torch
 
 import mvrecon as mv
@@ -37,3 +38,21 @@ def test_rods_are_closed_around_their_lines():
     # every vertex is of two or more faces, none of another rod
     assert rods.faces.flatten().bincount().min() >= 2
     assert (rods.faces // 6 == rods.faces[:, :1] // 6).all()
+
+
+@pytest.mark.parametrize("pixel", [1e-3, 1.0, 1e3])
+def test_parallel_beams_without_an_end_are_drawn_to_scale_with_their_grid(pixel):
+    """Pixels of a micrometre were dots half a metre from the grid. The lines stay those of the rig,
+    on the same side of it.
+    """
+    rig = mv.parallel(5, {"pixels": [8, 16], "pixel_mm": pixel, "offset_mm": [0, pixel]})
+    grid = mv.Grid.centred(8, spacing=pixel, centre=(0, pixel, 0))
+    parts = segments(rig, grid)
+    assert 16 * pixel < torch.cat(list(parts.values())).abs().max() < 64 * pixel
+    start, end = rig.rays()
+    way = end[0, 0, 0] - start[0, 0, 0]
+    rays = parts["rays"][:4]
+    drawn = rays[:, 1] - rays[:, 0]
+    assert torch.allclose(drawn / drawn.norm(dim=1, keepdim=True), way / way.norm())
+    aside = torch.linalg.cross(rays[0, 0] - start[0, 0, 0], way / way.norm())
+    assert aside.norm() == pytest.approx(pixel / 2**0.5, rel=1e-5)  # the first pixel's corner

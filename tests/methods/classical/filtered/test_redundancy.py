@@ -460,6 +460,21 @@ def test_an_automatic_grid_has_no_lines_that_are_not_measured(beam, columns):
             redundancy_weights(rig, auto_grid(full_fan(rig)))
 
 
+@pytest.mark.parametrize("far", [300.0, 500.0, 1000.0])
+def test_a_cube_of_voxels_about_the_field_of_a_square_panel_gives_no_warning(far):
+    """It is as high as the field on the axis, and so wider than it: the fan is narrower than the
+    panel, demagnified. An object cut by the views is named by them, see test_truncation. Also
+    tried: 64 to 512 voxels, fans of 5 to 18 degrees to a side.
+    """
+    rig = circular(180, far, 2 * far, detector(256, 0.75, 0.0, 256))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        redundancy_weights(rig, auto_grid(rig, size=(256, 256, 256)))
+    with pytest.warns(UserWarning, match="all at .* mm from the axis"):
+        wide = auto_grid(rig).size[0] * auto_grid(rig).spacing[0]
+        redundancy_weights(rig, Grid.centred(256, spacing=1.08 * wide / 256))
+
+
 def clusters(count: int, views: int, width: float, arc: float) -> list[float]:
     """Angles of views at so many directions, each within so many degrees."""
     return [
