@@ -69,8 +69,7 @@ class Output:
         written = [out, output.beside(SIGMA_ENDING), *(folder / name for name in PRODUCTS)]
         if settings.calibrate:
             written += [output.beside(RIG_ENDING), output.beside(SCAN_ENDING)]
-        joint = {str(number): own for number, own in enumerate(settings.joint or ())}
-        check_inputs({**vars(settings), "joint": joint, "out": None}, written)
+        check_inputs({**vars(settings), "out": None}, written)
         return output
 
     def for_scan(self, scan: Scan) -> "Output":

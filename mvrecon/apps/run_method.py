@@ -23,7 +23,7 @@ from mvrecon.core.quantities import PositiveInt
 from mvrecon.data.attenuation import CONCENTRATION
 from mvrecon.methods.classical import stopping
 from mvrecon.methods.classical.solver import Iterate
-from mvrecon.methods.method import Solver, build_method
+from mvrecon.methods.method import Solver, build_method, check_volume
 
 #: Views that a streamed method's volume is compared with, at most; pixels of these at a time.
 COMPARED_VIEWS, COMPARED_PIXELS = 40, 2**24
@@ -243,6 +243,7 @@ def _iterated(scan: Scan, method: Method, device: str, bar: Bar) -> _Run:
             rules = () if sigma is None else (stopping.discrepancy(sigma),)
             monitor = stopping.combined(runs, *rules)
             volume = solver.solve(A, views, monitor=monitor, **options)
+        check_volume(volume, method.name, views, A)
     except KeyboardInterrupt:
         if runs.last is None:
             raise

@@ -7,6 +7,7 @@ A registered method is a module class, called as `module(views, A)`, or a functi
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -19,7 +20,13 @@ from mvrecon.core.parts import METHODS, PROJECTORS, ClassicalPart, MethodPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
-from mvrecon.operators.operator import LinearOperator, Projector, check, check_views
+from mvrecon.operators.operator import (
+    LinearOperator,
+    Projector,
+    check,
+    check_floating,
+    check_views,
+)
 
 
 class CameraPrior(NamedTuple):
@@ -175,13 +182,47 @@ class Solver(nn.Module):
 
     def _volume(self, A: Projector, views: Tensor) -> Tensor:
         volume = self.solve(A, views, **self.options)
-        name = getattr(self.solve, "__name__", "the method")
-        check(volume, f"of {name} a volume [b c d h w]", A.domain_shape, views.device)
+        check_volume(volume, getattr(self.solve, "__name__", "the method"), views, A)
         return volume
 
 
+def check_volume(volume: Tensor, name: str, views: Tensor, A: LinearOperator) -> None:
+    """Check that a method returned a volume on the grid for each sample and channel of the views.
+
+    Raises:
+        TypeError, ValueError: anything else; the message names the method.
+    """
+    check(volume, f"of {name} a volume [b c d h w]", A.domain_shape, views.device)
+    check_floating(volume, f"of {name} a volume")
+    if volume.shape[:2] != views.shape[:2]:
+        raise ValueError(
+            f"Expected of {name} a volume of as many samples and channels as the views have, "
+            f"{tuple(views.shape[:2])}, got {tuple(volume.shape[:2])}"
+        )
+
+
+def _check_result(
+    name: str, method: nn.Module, args: tuple[Any, ...], options: dict[str, Any], out: Any
+) -> None:
+    """A hook of a method's call, which checks what it returns.
+
+    Raises:
+        TypeError, ValueError: no `Reconstruction`, or volumes that are not on the grid.
+    """
+    views, A, *_ = inspect.signature(method.forward).bind(*args, **options).args
+    if not isinstance(out, Reconstruction):
+        raise TypeError(
+            f"Expected of {name} a Reconstruction, got {type(out).__name__}; "
+            f"Reconstruction(volume) makes one of a tensor"
+        )
+    check_volume(out.volume, name, views, A)
+    if out.sigma is not None:
+        check_volume(out.sigma, f"{name}, sigma,", views, A)
+
+
 def build_method(config: MethodPart) -> nn.Module:
-    """Build a method from its name and options, `{"name": ..., **options}`.
+    """Build a method from its name and options, `{"name": ..., **options}`; what it returns is
+    checked at every call.
 
     Raises:
         LookupError: an unknown name.
@@ -191,6 +232,7 @@ def build_method(config: MethodPart) -> nn.Module:
     name, options = config["name"], {k: v for k, v in config.items() if k != "name"}
     part: Any = METHODS.get(name)
     method: Any = part(**options) if inspect.isclass(part) else Solver(part, options)
+    method.register_forward_hook(partial(_check_result, name), with_kwargs=True)
     return method
 
 

@@ -2,6 +2,7 @@
 
 import random
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -277,17 +278,18 @@ def report_checkpoint(last: Path) -> Iterator[None]:
     from before at once, and the training would end before it writes the checkpoint of that step.
 
     Raises:
-        SystemExit: on SIGTERM or Ctrl-C, where Lightning would exit silently or with success.
+        SystemExit: on SIGTERM or Ctrl-C, where Lightning would exit silently or with success; its
+            code is 128 plus the number of the signal, as of other commands.
     """
     main = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGTERM, signal.SIG_DFL) if main else None
     try:
         yield
     except SIGTERMException as stop:
-        raise SystemExit(f"Stopped by SIGTERM; {_kept(last)}") from stop
+        raise _end(signal.SIGTERM, "SIGTERM", last) from stop
     except SystemExit as stop:
         if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning ends the process itself
-            raise SystemExit(f"Stopped by Ctrl-C; {_kept(last)}") from stop
+            raise _end(signal.SIGINT, "Ctrl-C", last) from stop
         raise
     except Exception as error:
         if last.exists() or previous(last).exists():
@@ -300,6 +302,14 @@ def report_checkpoint(last: Path) -> Iterator[None]:
 
 def _stop(*_: Any) -> None:
     raise SIGTERMException
+
+
+def _end(number: signal.Signals, name: str, last: Path) -> SystemExit:
+    """The exit of a signal, which is said: a code that is a number is not."""
+    stop = SystemExit(f"Stopped by {name}; {_kept(last)}")
+    sys.stderr.write(f"{stop}\n")
+    stop.code = 128 + number
+    return stop
 
 
 def _kept(last: Path) -> str:

@@ -55,7 +55,9 @@ def run_lock(
     Warns:
         UserWarning: the run began with other versions or other code of its plugins.
     """
-    own = (file, VERSIONS, DIGESTS_FILE, RIG)
+    own = (file, VERSIONS)
+    if file == SETTINGS:  # an evaluation writes no rig
+        own += (DIGESTS_FILE, RIG)
     if not (folder / file).is_file():
         check_inputs(settings, [folder / name for name in (*own, RESULTS, *products)])
     with claimed(folder):

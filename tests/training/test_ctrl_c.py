@@ -9,8 +9,10 @@ from mvrecon.training.resume import report_checkpoint
 
 
 @pytest.mark.parametrize("kept", [False, True])
-def test_ctrl_c_reports_how_to_resume(kept: bool, tmp_path: Path):
-    """Lightning turns it into an exit without a word."""
+def test_ctrl_c_reports_how_to_resume(kept: bool, tmp_path: Path, capsys):
+    """Lightning turns it into an exit without a word; the status is that of the signal, and the
+    report is given once. Also tried: SIGTERM.
+    """
     run = tmp_path / "run"
     last = run / "checkpoints" / "cross_view_small" / "last.ckpt"
     last.parent.mkdir(parents=True)
@@ -18,11 +20,12 @@ def test_ctrl_c_reports_how_to_resume(kept: bool, tmp_path: Path):
         last.touch()
     then = "resumes it" if kept else "starts again"
     message = f"Stopped by Ctrl-C; .*mvrecon-train resume={run} {then}"
-    with pytest.raises(SystemExit, match=message), report_checkpoint(last):
+    with pytest.raises(SystemExit, match=message) as stop, report_checkpoint(last):
         try:
             raise KeyboardInterrupt
         except KeyboardInterrupt:
             sys.exit(1)
+    assert stop.value.code == 130 and capsys.readouterr().err == f"{stop.value}\n"
 
 
 def test_other_exits_are_unchanged(tmp_path: Path):

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -164,3 +165,15 @@ def test_a_run_that_another_process_is_at_work_on_is_not_resumed(run, root, caps
     assert code == 1 and other.returncode == 0
     assert f"is in use by process {other.pid} on" in capsys.readouterr().err
     assert (folder / "results.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("file", "written"), [(run_folder.SETTINGS, True), ("evaluation.yaml", False)]
+)
+def test_a_rig_in_an_evaluations_folder_is_no_file_that_it_writes(file, written, tmp_path):
+    settings = {"camera": {"path": str(tmp_path / "rig.json")}}
+    with (
+        pytest.raises(ValueError, match="camera.path") if written else nullcontext(),
+        run_folder.run_lock(tmp_path, settings, file),
+    ):
+        pass

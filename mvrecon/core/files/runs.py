@@ -164,15 +164,27 @@ def of_weights(path: str | os.PathLike[str]) -> Path:
     )
 
 
+def _texts(value: Any) -> Iterator[str]:
+    """The texts of a value, or within nested lists and mappings."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, list | tuple | Mapping):
+        for item in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(item)
+
+
 def check_inputs(settings: Mapping[str, Any], written: Iterable[Path]) -> None:
-    """Check that no path in settings is of a file that a run writes, also through links.
+    """Check that no path in settings is of a file that a run writes, also through links, in lists
+    and products (`a.nii * b.nii`), and of data sets (`file.h5:views`).
 
     Raises:
         ValueError: one is; the message names the setting.
     """
     places = {path.resolve() for path in written}
     for keys, value in flatten(settings):
-        if isinstance(value, str) and from_home(value).resolve() in places:
+        names = [name for text in _texts(value) for name in text.split(" * ")]
+        files = [*names, *(name.rpartition(":")[0] for name in names)]
+        if any(from_home(name).resolve() in places for name in files):
             raise ValueError(
                 f"Expected an input that the run does not write, got "
                 f"{'.'.join(map(str, keys))}={value}; choose another hydra.run.dir (or out)"

@@ -172,8 +172,8 @@ def _best(A: Projector, measured: Float[Tensor, "b 1 m v u"], by: Alignment) -> 
     """
     lost = by.gain == 0
     shifted = replace(by, gain=torch.ones_like(by.gain).masked_fill(lost, 0))
-    if measured.shape[2] < 2:
-        return CorrectedViews(_filled(aligned(measured, by), lost, measured), by)
+    if measured.shape[2] < 2:  # no other view predicts it
+        return CorrectedViews(measured, replace(shifted, shift_px=torch.zeros_like(by.shift_px)))
     halves = [view_subset(A, range(first, measured.shape[2], 2)) for first in (0, 1)]
     best = (measured, torch.zeros_like(by.shift_px), shifted.gain)
     least = _prediction_error(halves, measured, *best)

@@ -473,3 +473,19 @@ def test_beams_of_one_row_are_aligned_as_panels_are(make):
     by = self_aligned(A, (views * gain[:, None, None])[None, None].float()).alignment
     assert (by.shift_px[0] - shift).abs().max() < 0.12
     assert (by.gain[0] / gain - 1).abs().max() < 0.01
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_right_views_stay_as_measured(count):
+    """One view, which no other predicts, was shifted or scaled. Also tried: views of zero, half
+    precision, batches of these.
+    """
+    rig = circular(count, 300.0, 450.0, {"pixels": [24, 24], "pixel_mm": 7.0})
+    grid = Grid.centred(16, spacing=6.0)
+    A, centre = PROJECTORS.build("drr", grid=grid, cameras=rig), torch.tensor([10.0, 5.0, 0.0])
+    apart = (voxel_centres(grid) - centre).norm(dim=-1)
+    views = A(0.02 * (apart < 25).float()[None, None]) * torch.tensor([1.0, 2.0]).view(
+        2, 1, 1, 1, 1
+    )
+    corrected, by = self_aligned(A, views)
+    assert torch.equal(corrected, views) and not by.shift_px.any() and (by.gain == 1).all()
