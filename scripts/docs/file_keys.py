@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.core.files.keys import Key
-from mvrecon.data import dicom, dicom_image, itk_headers, nifti, vgi
+from mvrecon.data import dicom, dicom_image, itk_headers, linked, nifti, vgi
 from mvrecon.data.projections import dicom_views, nexus, png, rtk_images, tiff
 from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
 from mvrecon_spect.files import interfile_keys, nm_keys, nm_volume
@@ -33,6 +33,7 @@ FORMATS: dict[str, Sequence[Key]] = {
     "TIFF": tiff.TIFF_KEYS,
     "PNG": png.PNG_KEYS,
     "HDF5 of beamlines": nexus.KEYS,
+    "Attributes of HDF5": linked.ATTRIBUTES,
     "EDF": rtk_images.EDF_KEYS,
     "Elekta's .his": rtk_images.HIS_KEYS,
     "Varian's .xim": rtk_images.XIM_KEYS,

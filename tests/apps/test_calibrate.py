@@ -140,15 +140,11 @@ def test_the_axis_of_a_tilted_rig_is_that_of_its_tilted_plane():
     centres = [[4.0, -6, 6], [-10, 8, -6], [12, 3, 5], [-3, -14, -9]]
     radii = [[20.0, 14, 8], [6, 8, 6], [4, 4, 4], [5, 4, 5]]
     bodies = torch.tensor([centres, radii], dtype=torch.float64)
-    turn, values = (
-        torch.eye(3, dtype=torch.float64).expand(4, 3, 3),
-        torch.full((4,), 0.02).double(),
-    )
+    turn = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+    values = torch.full((4,), 0.02, dtype=torch.float64)
     solid = Phantom((Solids("ellipsoid", bodies[0], turn, bodies[1], values),))
-    rig, by = (
-        parallel(60, {"pixels": [32, 56], "pixel_mm": 1.0}, arc_degrees=360.0),
-        Misalignment.none(60),
-    )
+    rig = parallel(60, {"pixels": [32, 56], "pixel_mm": 1.0}, arc_degrees=360.0)
+    by = Misalignment.none(60)
     by.offset_px[:, 0], by.tilt_degrees[:, KINDS["tilt"].column] = 3.0, 1.0
     views = solid.integrals(*misaligned(rig, by).rays(), misaligned(rig, by).ray_extent).float()
     measured = ViewsInMemory(views, torch.ones_like(views, dtype=torch.bool))

@@ -280,10 +280,10 @@ def test_pairs_of_nrrd_that_may_change_what_is_read_are_refused(line, tmp_path):
 
 
 @pytest.mark.parametrize("ending", ["mha", "mhd", "nrrd"])
-@pytest.mark.parametrize("source", ["nii", "dcm", "nrrd", "mnc", "tif", "vtk", "mha"])
+@pytest.mark.parametrize("source", ["nii", "dcm", "nrrd", "mnc", "tif", "mha"])
 def test_images_that_itk_converts_are_read_without_a_warning(source, ending, tmp_path):
     """With the keys of other formats that ITK copies, also where it converts them twice, and
-    with pairs of 3D Slicer.
+    with pairs of 3D Slicer. Not VTK's: ITK's writer of these changes the process's locale.
     """
     image = sitk.GetImageFromArray(VALUES.astype("u2" if source in ("tif", "dcm") else "f4"))
     image.SetMetaData("0028|1053", "2")

@@ -14,7 +14,6 @@ import numpy as np
 from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
 from mvrecon.core.files.keys import EFFECTS, Key, unknown_names
 from mvrecon.data.linked import (
-    ATTRIBUTES,
     VIEW_AXES,
     MissingFile,
     Place,
@@ -130,7 +129,6 @@ KEYS = (
     ),
     *nexus_detector.KEYS,
     *nexus_axes.KEYS,
-    *ATTRIBUTES,
 )
 #: Words of fields beside the frames that a warning names, and their values that change nothing.
 FIELD_EFFECTS = {
