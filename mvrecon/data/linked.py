@@ -40,9 +40,10 @@ ATTRIBUTES = (
     ),
     Key(
         "NX_class, long_name, target, signal, primary, axis, interpretation, description, name, "
-        "local_name, title, label, comment, source, date, timestamp, start_time, end_time, creator, version, history, "
-        "uncertainties, check_sum, default, SILX_style*, NDArrayNumDims, NDArrayColorMode, NDAttr*, image_nr_*, "
-        "decimals, file_name, equipment_component",
+        "local_name, title, label, comment, source, date, timestamp, start_time, end_time, "
+        "creator, version, history, uncertainties, check_sum, default, SILX_style*, "
+        "NDArrayNumDims, NDArrayColorMode, NDAttr*, image_nr_*, decimals, file_name, "
+        "equipment_component",
         "ignored",
         "texts, links and plots of NeXus and areaDetector",
     ),
