@@ -52,7 +52,7 @@ class Remembering(Sound):
 
 #: A change of the volumes of a sound method, and the message about it.
 BROKEN = {
-    "shape": (lambda x: x[..., 1:], "the volume is .*, expected"),
+    "shape": (lambda x: x[..., 1:], "of broken a volume"),
     "dtype": (lambda x: x.float(), "float64 views is torch.float32"),
     "NaN": (lambda x: x.where(x < x.max(), torch.nan), "not finite"),
     "random": (lambda x: x * torch.rand(1), "same bits"),
@@ -72,7 +72,7 @@ def test_a_method_that_breaks_its_contract_is_caught(name, monkeypatch):
     change, message = BROKEN[name]
     monkeypatch.setattr(Sound, "volume", lambda self, views, A: change(self.weight * A.T(views)))
     monkeypatch.setitem(METHODS._parts, "broken", Sound)
-    with pytest.raises(AssertionError, match=message):
+    with pytest.raises((AssertionError, ValueError), match=message):
         check_method("broken", small_projector())
 
 
