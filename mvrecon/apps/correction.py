@@ -22,7 +22,7 @@ from mvrecon.geometry.cameras.field import extended_to_field, pixels_of_voxel
 from mvrecon.geometry.cameras.random_rigs import misaligned
 from mvrecon.geometry.grid import Grid, coarse
 from mvrecon.geometry.rigid import unit
-from mvrecon.methods.calibration.alignment import blurred
+from mvrecon.methods.calibration.alignment import blurred, translated
 from mvrecon.methods.calibration.axis import KEPT, refined_axis
 from mvrecon.methods.calibration.conjugate import conjugate_axis
 from mvrecon.methods.calibration.from_data import (
@@ -47,6 +47,9 @@ from mvrecon.operators.operator import LinearOperator
 MAX_GRID_VOXELS, MAX_ROUNDS, MAX_FITS = 64, 12, 3
 #: Arrays of the views' size that a fit holds.
 HELD_ARRAYS = 8
+#: Share of pixels that were not measured up to which views are aligned, and the weight of one in an
+#: aligned pixel from which on that counts as not measured either.
+MAX_UNMEASURED, MAX_UNMEASURED_WEIGHT = 0.1, 0.05
 #: f(A, views) -> aligned views, and the errors of their cameras.
 Align: TypeAlias = Callable[[LinearOperator, Tensor], tuple[Tensor, Alignment]]
 
@@ -96,21 +99,22 @@ def corrected_scan(
     """The scan with aligned views, and the errors of its cameras.
 
     Views are aligned on the scan's grid, or where the object extends beyond it, in the field of
-    half of the views, in at most `MAX_GRID_VOXELS` voxels a side.
+    half of the views, in at most `MAX_GRID_VOXELS` voxels a side. Pixels that were not measured are
+    filled from their neighbours; the mask moves with the views.
 
     Raises:
-        ValueError: pixels that were not measured; as `self_aligned`.
+        ValueError: many pixels that were not measured; as `self_aligned`.
 
     Warns:
         UserWarning: views that are not aligned, as most of them are lost.
     """
     whole = scan.measured.whole()
-    if missing := int((~whole.mask).sum()):
+    if (missing := (~whole.mask).double().mean().item()) > MAX_UNMEASURED:
         raise ValueError(
-            f"expected every pixel to be measured for correct=align, got {missing} dead or "
-            f"saturated ones; crop them by views.rows and views.columns"
+            f"expected at most {MAX_UNMEASURED:.0%} of dead or saturated pixels for correct=align, "
+            f"got {missing:.0%}; crop them by views.rows and views.columns"
         )
-    views = whole.views[None, None].to(device)
+    views = _filled(whole, 1, scan.counts).to(device)
     box = _grid_about(scan, views)
     grid = scan.grid if box is scan.grid else coarse(box, MAX_GRID_VOXELS)
     corrected, by = align(replace(scan, grid=grid).operator().to(device), views)
@@ -124,7 +128,9 @@ def corrected_scan(
         measured = ViewsInMemory(whole.views, whole.mask).divided_by(by.gain[0])
         cameras = scan.cameras.shifted(by.shift_px[0].to(scan.cameras.origin))
         return replace(scan, measured=measured, cameras=cameras), by
-    return replace(scan, measured=ViewsInMemory(corrected[0, 0].cpu(), whole.mask)), by
+    weight = translated((~whole.mask)[None, None].to(by.shift_px), -by.shift_px)[0, 0].abs()
+    mask = weight < MAX_UNMEASURED_WEIGHT
+    return replace(scan, measured=ViewsInMemory(corrected[0, 0].cpu(), mask)), by
 
 
 def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[Scan, Estimate]:

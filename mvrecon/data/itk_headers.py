@@ -105,7 +105,7 @@ REPEATED = (
 META_EFFECTS = {
     **EFFECTS,
     "angle|euler|rotat|tilt|shear|direction|quaternion|matrix|affine|transform|translat|origin|"
-    "axes|(?<!patient)(orient|position)": 0,
+    "axes|(?<!patient)(?<!patient_)(?<!com)(orient|position)": 0,
     "spacing|(voxel|pixel).?size|^skip|data.?offset": None,
     "^NRRD_.*units": "mm",
     "^NRRD_old": math.nan,

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.core.files.keys import Key, check_keys, has_effect, warn_of_unknown
+from mvrecon.core.files.keys import SEARCHED, Key, check_keys, has_effect, warn_of_unknown
 from mvrecon.data.resample import Planes, Slabs, oriented, planes, right_angled, storable
 from mvrecon.geometry.grid import Grid
 
@@ -277,7 +277,7 @@ def _texts(path: Path, header: Any) -> Iterator[str]:
     for name, value in texts:
         text = value.decode("latin-1").strip("\0 ")
         parts = [BETWEEN.split(part, maxsplit=1) for part in re.split("[;,\n]", text)]
-        stated = any(has_effect(part[0], part[1]) for part in parts if len(part) == 2)
+        stated = any(has_effect(p[0][-SEARCHED:], p[1]) for p in parts if len(p) == 2)
         if stated or INVERSE_CM.search(text):
             yield f"{name} {checks.shown(text)}"
 

@@ -125,6 +125,40 @@ def test_a_grid_of_a_part_of_the_object_aligns_views_as_one_of_all_of_it(name, b
     assert not still.shift_px.any() and (still.gain == 1).all()
 
 
+@pytest.mark.parametrize("fault", ["pixel", "zinger", "column, row and cluster"])
+def test_views_with_pixels_that_were_not_measured_are_aligned_as_those_without(fault):
+    """Whatever these pixels hold: the shift of one view is found, and measured pixels of the
+    aligned views are those of the clean scan.
+    """
+    rig = circular(24, 300.0, 450.0, {"pixels": [32, 44], "pixel_mm": 3.0})
+    centres = torch.tensor([[0.0, 0, 0], [8, 5, -9], [-10, 3, 8], [2, -12, 4]])
+    sizes = torch.tensor([[24.0], [4], [5], [6]]).expand(4, 3)
+    values = torch.tensor([0.02, 0.04, 0.03, -0.01])
+    balls = Phantom((Solids("ellipsoid", centres, torch.eye(3).expand(4, 3, 3), sizes, values),))
+    shift = torch.zeros(24, 2)
+    shift[3] = torch.tensor([1.5, -1.0])
+    y = balls.integrals(*rig.shifted(shift.double()).rays(), rig.ray_extent).float()
+    mask = torch.ones_like(y) > 0
+    if fault == "pixel":
+        mask[:, 16, 20] = False
+    elif fault == "zinger":
+        mask[3, 16, 20] = False
+    else:
+        mask[:, :, 30] = mask[:, 9] = mask[:, 20:23, 12:15] = False
+    found = []
+    for stored, measured in ((y, torch.ones_like(mask)), (y.where(mask, 9.0), mask)):
+        scan = Scan(
+            ViewsInMemory(stored, measured), rig, mv.Grid.centred(32, spacing=2.0), {"name": "drr"}
+        )
+        aligned, by = corrected_scan(scan, self_aligned)
+        assert (by.shift_px[0] - shift).abs().max() < 0.1 and (by.gain[0] - 1).abs().max() < 0.01
+        found.append(aligned.measured.whole())
+    kept = found[1].mask
+    assert torch.equal(kept[0], mask[0]) and (~kept[3]).sum() >= (~mask[3]).sum()
+    error = (found[1].views - found[0].views)[kept]
+    assert error.abs().max() < 0.02 * y.max()
+
+
 def test_a_method_with_alignment_equals_the_method_on_aligned_views(case):
     A, _, views = case
     options = {"name": "sirt", "iterations": 5}

@@ -40,13 +40,23 @@ class Key(NamedTuple):
 #: Words of unknown keys that change values, units or the order of values, and the value of such a
 #: key that does not.
 EFFECTS = {
-    "scal(e|ing)(?!_?(types?|bar))|slope|factor|gain|multipl|exponent|conversion|coefficient": 1,
+    "(?<!gr[ae]y)scal(e|ing)(?!_?(types?|bar))|slope|factor|(?<!a)gain|multipl(?!ex)|exponent|"
+    "conversion(?!.?(soft|script|prog))|coefficient": 1,
     "offset|intercept|bias|skip": 0,
-    "fill|missing|valid|nodata": math.nan,
+    "fill|missing|valid(?!at)|nodata": math.nan,
     "mirror|flip|transpos": 0,
-    "unit|calibrat|quanti|unsigned|endian|logarithm|"
-    "(?<![a-z])order(?![a-z])|(byte|ax[ei]s|dim[a-z]*|index|storage).?order": None,
+    "unit(?!y)|calibrat|quanti(?!t)|unsigned|endian|logarithm|"
+    "(?<![a-z])order(?![a-z])|(byte|ax[ei]s|dim[a-z]{0,20}|index|storage).?order": None,
 }
+#: Those of fields and texts beside images, which also state how these were corrected or turned.
+IMAGE_EFFECTS = {
+    **EFFECTS,
+    "flip|mirror|transpos|invert|revers|swap|polar_angle|tilt|"
+    "(image|frame|detector|camera).?rotat": 0,
+    "(correct|subtract|normali[sz])ed|distort": 0,
+}
+#: Values of any key with such a word that change nothing.
+OFF = ("no", "none", "off", "false", "unknown")
 
 
 #: Unknown keys that a warning names, and characters of a name that are searched for words.
@@ -62,7 +72,12 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
     word of `effects`, and its value is not the one that changes nothing.
     """
     neutral = _neutral(name, effects)
-    return bool(neutral) and _plain(value) != _plain(neutral[-1])
+    return bool(neutral) and _plain(value) not in (_plain(neutral[-1]), *OFF)
+
+
+def mentions(text: str, effects: Mapping[str, Any] = EFFECTS) -> bool:
+    """Whether a text has a word of `effects` anywhere."""
+    return any(re.search(words, text, re.IGNORECASE) for words in effects)
 
 
 def _neutral(name: str, effects: Mapping[str, Any]) -> list[Any]:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import MILLIMETRES, Refused, millimetres, shown
-from mvrecon.core.files.keys import Key, has_effect
+from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, has_effect, mentions
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -102,13 +102,14 @@ NAMED = re.compile(
 )
 #: Names of scales of the display, of stages and lenses; and units of other things than values.
 OF_DISPLAY = re.compile(
-    "spatial|stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|"
-    r"(?<![a-z])(date|time)\b",
+    r"spatial|^stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|"
+    r"(?<![a-z])(date|time)(?=\W*$|.?(unit|scale))",
     re.IGNORECASE,
 )
 OTHER_UNITS = {
     *MILLIMETRES,
-    *("pixel", "pixels", "px", "inch", "in", "s", "sec", "ms", "us", "deg", "degrees", "rad"),
+    *("counts", "adu", "dn", "pixel", "pixels", "px", "inch", "in", "s", "sec", "ms", "us"),
+    *("deg", "degrees", "rad"),
     *("v", "kv", "kev", "ev", "ma", "ua", "a", "w", "c", "k", "bit", "bits"),
 }
 #: A comma between thousands.
@@ -127,10 +128,10 @@ def effects(text: str) -> list[str]:
     """Names of the entries of a text that may change values: lines of a name and a value, JSON,
     XML; none of OME's and MetaMorph's texts, whose entries are of the display and the microscope.
     """
-    if not has_effect(text, text) or OME.search(text) or text.startswith("<MetaData"):
+    if not mentions(text, IMAGE_EFFECTS) or OME.search(text) or text.startswith("<MetaData"):
         return []
     known = {name for program, name in KNOWN if program == "Dectris" or program in text}
-    lines = [line for line in LINE.sub("", text).splitlines() if has_effect(line, line)]
+    lines = [x for x in LINE.sub("", text).splitlines() if mentions(x, IMAGE_EFFECTS)]
     found = [pair for line in lines for pair in ENTRY.findall(line)]
     for pattern in (LINE, ELEMENT, NAMED):
         found += pattern.findall(text)
@@ -141,7 +142,7 @@ def effects(text: str) -> list[str]:
             if name.strip() not in known
             and not OF_DISPLAY.search(name)
             and any(
-                has_effect(name, part) and part.lower() not in OTHER_UNITS
+                has_effect(name, part, IMAGE_EFFECTS) and part.lower() not in OTHER_UNITS
                 for part in re.findall(r"[^\s,;()\[\]]+", value)
             )
         }

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
-from mvrecon.core.files.keys import EFFECTS, Key, unknown_names
+from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, unknown_names
 from mvrecon.data.linked import (
     VIEW_AXES,
     MissingFile,
@@ -131,12 +131,7 @@ KEYS = (
     *nexus_axes.KEYS,
 )
 #: Words of fields beside the frames that a warning names, and their values that change nothing.
-FIELD_EFFECTS = {
-    **EFFECTS,
-    "flip|mirror|transpos|invert|swap|polar_angle|tilt|(image|frame|detector|camera).?rotat": 0,
-    "(correct|subtract|normali[sz])ed|distort": 0,
-    "time_of_flight": None,
-}
+FIELD_EFFECTS = {**IMAGE_EFFECTS, "time_of_flight": 0}
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Pixels by which a sample may move between views.
@@ -389,11 +384,6 @@ class _Layout(NamedTuple):
         self._warn_of_moves(keys, pixel)
         limits = limits_of(self.detector, frames, keys)
         unknown = [*self._unknown_fields(), *(n for p in angles for n in unknown_attributes(p))]
-        unknown += [
-            f"{name}@units={field.units}"
-            for name, field in fields.items()
-            if len({field.units, frames.units} - {""}) > 1
-        ]
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
 
     def _unknown_fields(self) -> list[str]:

@@ -189,7 +189,8 @@ def mean_field(
 
     Warns:
         UserWarning: images of a flat field that differ, or a field of another exposure or beam than
-            the views, unless a file states exposures; unknown keys that the views do not have.
+            the views, unless a file states exposures; unknown keys that the views do not have, or
+            other units.
 
     Raises:
         Refused: several, no flat one, or one of another size or another part of the detector.
@@ -217,7 +218,10 @@ def mean_field(
                 f"{stack.path}: expected a {name} field with the {key} {own} of the views, got "
                 f"{other}; pixels must be those of the views"
             )
-    warn_of_unknown(stack.path, sorted({*stack.unknown} - {*views.unknown}))
+    unknown = sorted({*stack.unknown} - {*views.unknown})
+    if len({units.casefold() for units in (stack.units, views.units) if units}) > 1:
+        unknown.append(f"{name}@units={stack.units}")
+    warn_of_unknown(stack.path, unknown)
     mean, levels = stack.mean()
     least, most = levels.min().item(), levels.max().item()
     if name == "flat" and most - least > MAX_FLAT_CHANGE * levels.mean().item():

@@ -147,8 +147,8 @@ TIFF_KEYS = (
     Key(
         "DocumentName, ImageDescription, Make, Model, PageName, Software, DateTime*, Artist, "
         "HostComputer, Copyright, XMP, IPTCNAA, ImageResources, ImageTitle, ImageID, "
-        "ImageUniqueID, OriginalFileName, ProcessingSoftware, XPTitle, XPComment, XPAuthor, "
-        "XPKeywords, XPSubject, Rating*, Padding, OffsetSchema",
+        "ImageUniqueID, ImageSourceData, OriginalFileName, ProcessingSoftware, XPTitle, XPComment, "
+        "XPAuthor, XPKeywords, XPSubject, Rating*, Padding, OffsetSchema",
         "ignored",
         "texts",
     ),

@@ -43,17 +43,22 @@ from mvrecon.geometry.cameras.camera import Cameras
 
 #: Share of the pixels that views alone may show to be wrong.
 MAX_WRONG = 0.1
-#: Units of logarithms, and those of line integrals that need no factor: of another base, a length
-#: or a number of counts they would.
+#: Units of logarithms and of attenuation.
 LOGARITHMS = re.compile(
-    r"absor|optical.?dens|^od$|attenuation|\b(ln|log|lg)|1/ ?[cmnuµ]?m\b|\b[cmnuµ]?m ?\^?-1",
+    r"absor(?!bed)|\bm?abs\b|optical.?de(ns|p)|^od$|extinct|attenuat|line.?integral|^projections?$|"
+    r"(?<![a-z])((neg|minus)[ _-]?)?(ln|lg|log(arithm(ic)?)?)(10|2|e)?(?![a-z])|"
+    r"^(1 ?/|/|per) ?[cmnuµ]?m\b|\b[cmnuµ]?m ?(\^|\*\*)?\{?[-⁻][1¹]",
     re.IGNORECASE,
 )
-INTEGRALS = re.compile(
-    r"|1|1/mm \* mm|none|(unit|dimension)less|a\.? ?u\.?|arb.*|.*\bln\b.*|(line )?integrals?|"
-    r"(linear )?attenuation|absorption|projections?",
-    re.IGNORECASE,
-)
+#: Units of each kind that need no factor, as another base of logarithms, a length or a rate does.
+PLAIN_UNITS = {
+    "integrals": re.compile(
+        r"|1|1/mm \* mm|none|(unit|dimension)less|a\.? ?u\.?|arb.*|.*\bln\b.*|(neg|minus)[ _-]?log|"
+        r"(line.?)?integrals?|(linear )?attenuation|absorption|projections?|optical depth|nepers?",
+        re.IGNORECASE,
+    ),
+    "counts": re.compile(r"|1|none|(unit|dimension)less|counts?|cnts?|photons?|events?", re.I),
+}
 #: Line integrals below this are more than an imperfect flat field: 5 % brighter than it.
 NEGATIVE = -0.05
 #: Views before and after each that zingers of one or two rows are compared with.
@@ -126,7 +131,7 @@ class MeasuredViews:
                 f"are right, say kind=integrals (views.kind), and views.dataset=<name> of a file "
                 f"without flat fields"
             )
-        other = kind == "integrals" and not INTEGRALS.fullmatch(stack.units)
+        other = kind in PLAIN_UNITS and not PLAIN_UNITS[kind].fullmatch(stack.units)
         warn_of_unknown(stack.path, [*stack.unknown, *[f"units={stack.units}"] * other])
         if kind == "counts" and options.linearise is not None:
             raise Refused(

@@ -87,7 +87,8 @@ KNOWN = {name.lower() for key in KEYS for name in key.names}
 NIKON_EFFECTS = {
     **EFFECTS,
     "level|tilt|roll|pitch|yaw|shift|step|angle|increment|direction|clockwise|rotat|revers|distort|"
-    "object|detector(?!.?(name|model|serial))|heli|spiral|conveyor|scan.?type": 0,
+    "invert|lineari[sz]|correct|focal.?spot|angular.?range|"
+    "(object|detector)(?!.?(name|model|serial|manufact|descr))|heli|spiral|conveyor|scan.?type": 0,
     "binn": 1,
 }
 
