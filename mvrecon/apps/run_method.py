@@ -109,6 +109,15 @@ class Method:
             raise ValueError(
                 f"{self.name} does not iterate: expected choose=null and stop.sigma=null"
             )
+        if self.choose and self.choose.get("every", 2) < 2:
+            raise ValueError(f"choose.every: expected at least 2, got {self.choose['every']}")
+        weighed = (
+            isinstance(self.module, Solver) and "weight" in signature(self.module.solve).parameters
+        )
+        if self.choose and self.choose.get("weights") and not weighed:
+            raise ValueError(
+                f"choose.weights: {self.name} has no option weight; leave out choose.weights"
+            )
 
     @classmethod
     def of(

@@ -596,6 +596,8 @@ def test_quiet_runs_print_sanity_checks_alone_and_verbose_ones_each_step(
         (("out=volume.raw",), "ends in"),
         (("choose={every: 8}",), "does not iterate"),
         (("stop.sigma=0.1",), "does not iterate"),
+        (("method=sirt", "choose={every: 1}"), "choose.every: expected at least 2"),
+        (("method=sirt", "choose={every: 5, weights: [0.1, 1]}"), "sirt has no option weight"),
         (("grid.size=[8, 8, 8]",), "grid.like"),
         (("grid.centre=[0, 0, 8]",), "grid.size and grid.spacing with grid.centre"),
         (("camera.detector.pixels=[36, 41]",), "detector"),

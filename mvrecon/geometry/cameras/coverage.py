@@ -16,6 +16,7 @@ from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.field import resolution, sees
 from mvrecon.geometry.grid import Grid, voxel_centres
 from mvrecon.geometry.lattice import centred_affine
+from mvrecon.geometry.rigid import unit
 
 #: Most blocks of voxels along an axis, whose centres are tested; fewer, but no fewer than the
 #: second number, where all blocks in all views would be more than the third.
@@ -27,6 +28,8 @@ RIM_POINTS = 64
 MIN_SEEN_SHARE = 0.4
 #: Share of the grid's inscribed ellipsoid, or of a body, that may be poorly seen without a warning.
 MAX_POOR_SHARE = 0.05
+#: Distance from the middle of a single slice, in its thickness, that rays may have without one.
+MAX_ASIDE = 0.1
 #: The value of a detector's `pixels` or `pixel_mm` that fits it to the grid.
 FIT = "fit"
 
@@ -257,8 +260,10 @@ def check_coverage(
 
     Warns:
         UserWarning: more than `MAX_POOR_SHARE` of the ellipsoid or of the bodies is poorly seen;
-            gives the shares of the grid and of the bodies, and a detector that would do.
+            gives the shares of the grid and of the bodies, and a detector that would do. Rays pass
+            beside the middle of a grid of one slice.
     """
+    _warn_of_rays_aside(cameras, grid)
     seen = _seen(cameras, grid)
     judged = [_shares(seen, _inscribed(seen.shape).to(seen))]
     whole = _shares(seen, torch.ones_like(seen))
@@ -270,6 +275,33 @@ def check_coverage(
     if not any(share.poor > MAX_POOR_SHARE for share in judged):
         return
     warnings.warn(f"{words}. {_advice(cameras, grid)}; {remedy}", stacklevel=2)
+
+
+def _warn_of_rays_aside(cameras: Cameras, grid: Grid) -> None:
+    """Warn if the rays nearest to the centre of a grid of one slice pass beside its middle: linear
+    interpolation between voxels gives them a part of the slice, and iterative methods read its
+    values high by as much.
+    """
+    rows, columns = cameras.shape
+    centre = grid.centre.to(cameras.origin)
+    last = torch.tensor([columns - 1, rows - 1]).to(centre)
+    u, v = cameras.project(centre[None])[:, 0, :2].round().clamp_min(0).minimum(last).mT[..., None]
+    pixel = cameras.origin + u * cameras.u + v * cameras.v
+    way = unit(cameras.origin - cameras.source if cameras.parallel else pixel - cameras.source)
+    aside = pixel - centre
+    aside = aside - (aside * way).sum(dim=1, keepdim=True) * way
+    for axis in (k for k, count in enumerate(grid.size) if count == 1):
+        step = grid.affine[:3, axis].to(centre)
+        part = (aside @ step / step.square().sum()).median().item()
+        if abs(part) > MAX_ASIDE:
+            place = (centre + part * step).tolist()
+            warnings.warn(
+                f"The rays nearest to the centre of the grid's one slice pass {abs(part):.2g} of "
+                f"its thickness beside the middle: iterative methods read values up to "
+                f"{1 / max(1 - abs(part), 0.1):.2g} times as high. Choose the centre "
+                f"{[round(x, 4) for x in place]} (grid.centre), or several slices",
+                stacklevel=3,
+            )
 
 
 def _advice(cameras: Cameras, grid: Grid) -> str:

@@ -1,11 +1,13 @@
 """How much of a grid a rig sees, and detectors fitted to a grid."""
 
 import math
+import re
 import warnings
 
 import pytest
 import torch
 
+import mvrecon as mv
 from mvrecon.core.parts import CAMERAS
 from mvrecon.geometry.cameras.coverage import (
     check_coverage,
@@ -269,3 +271,28 @@ def test_a_half_fan_is_an_offset_detector_all_around(rig, expected):
     assert half_fan(rig) == expected
     turned = rig.moved(torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), torch.ones(3))
     assert half_fan(turned) == expected
+
+
+@pytest.mark.parametrize("rows", [1, 24, 25])
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_rays_beside_the_middle_of_a_single_slice_are_named(rows, beam):
+    """Joseph's rays through the face between two slices have half of a single slice's integral, by
+    the length of its chord; at the centre that the warning names they have all of it.
+    """
+    grid = mv.Grid.centred(size=(16, 16, 1), spacing=1.6)
+    panel = {"pixels": [rows, 24], "pixel_mm": 3.2 if beam == "cone" else 1.6}
+    rig = mv.circular(1, 400.0, 800.0, panel) if beam == "cone" else mv.parallel(1, panel)
+
+    def share(grid):
+        A = mv.Drr(grid, rig) if beam == "cone" else mv.Radon(grid, rig)
+        return A(torch.ones(1, 1, *grid.shape)).amax().item() / (16 * 1.6)
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_coverage(rig, grid)
+    texts = [str(one.message) for one in caught if "one slice" in str(one.message)]
+    assert len(texts) == (rows == 24)
+    assert share(grid) == pytest.approx(0.5 if texts else 1.0, abs=0.02)
+    for text in texts:
+        place = [float(x) for x in re.search(r"centre \[(.*?)\]", text)[1].split(",")]
+        assert share(mv.Grid.centred(size=(16, 16, 1), spacing=1.6, centre=place)) > 0.98
