@@ -42,8 +42,9 @@ from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.methods.method import Alignment
 from mvrecon.operators.operator import LinearOperator
 
-#: Voxels along the longest side of the grid that a rig is fitted on; rounds at most, and fits of a
-#: tilt, each from the axis that the last one moves: by a fifth of the last time.
+#: Voxels along the longest side of the grid that a rig is fitted on; largest numbers of rounds, and
+#: of fits of a tilt: each begins with the axis for the tilt found before, whose change is about a
+#: fifth of the previous one.
 MAX_GRID_VOXELS, MAX_ROUNDS, MAX_FITS = 64, 12, 3
 #: Arrays of the views' size that a fit holds.
 HELD_ARRAYS = 8

@@ -231,7 +231,9 @@ def build_method(config: MethodPart) -> nn.Module:
     METHODS.check(config)
     name, options = config["name"], {k: v for k, v in config.items() if k != "name"}
     part: Any = METHODS.get(name)
-    method: Any = part(**options) if inspect.isclass(part) else Solver(part, options)
+    if not inspect.isclass(part):
+        return Solver(part, options)  # checks its volumes itself
+    method: Any = part(**options)
     method.register_forward_hook(partial(_check_result, name), with_kwargs=True)
     return method
 

@@ -48,7 +48,7 @@ EFFECTS = {
     "unit(?!y)|calibrat|quanti(?!t)|unsigned|endian|logarithm|"
     "(?<![a-z])order(?![a-z])|(byte|ax[ei]s|dim[a-z]{0,20}|index|storage).?order": None,
 }
-#: Those of fields and texts beside images, which also state how these were corrected or turned.
+#: Words of fields and texts beside images, which also state how the images were corrected or turned.
 IMAGE_EFFECTS = {
     **EFFECTS,
     "flip|mirror|transpos|invert|revers|swap|polar_angle|tilt|"
@@ -57,8 +57,6 @@ IMAGE_EFFECTS = {
 }
 #: Values of any key with such a word that change nothing.
 OFF = ("no", "none", "off", "false", "unknown")
-
-
 #: Unknown keys that a warning names, and characters of a name that are searched for words.
 NAMED, SEARCHED = 8, 256
 #: Values of an unknown key that state nothing.
@@ -121,10 +119,24 @@ def check_unknown(
 
 
 def unknown_names(names: Iterable[str], keys: Sequence[Key]) -> list[str]:
-    """Those of some names that no key of a format has, each once."""
+    """Return the names that are in no key of a format, each once."""
     patterns = (re.escape(name) for key in keys for name in key.names)
     known = re.compile("|".join(patterns).replace(r"\*", ".*").replace(r"\?", "."))
     return [name for name in dict.fromkeys(names) if not known.fullmatch(name)]
+
+
+def unknown_effects(
+    stated: Mapping[str, str], keys: Sequence[Key], effects: Mapping[str, Any]
+) -> list[str]:
+    """The keys, in lower case, that no key of a format has and that may change what is read, each
+    with its value.
+    """
+    known = {name.lower() for key in keys for name in key.names}
+    return [
+        f"{name}={value}"
+        for name, value in stated.items()
+        if name not in known and has_effect(name, value, effects)
+    ]
 
 
 def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_declared, io_library
-from mvrecon.core.files.keys import EFFECTS, Key, check_keys, has_effect
+from mvrecon.core.files.keys import EFFECTS, Key, check_keys, unknown_effects
 from mvrecon.data.projections.exposures import number_of
 from mvrecon.data.projections.stack import Header
 
@@ -52,7 +52,6 @@ EDF_KEYS = (
 )
 #: Words of unknown keys of EDF that change values, of which a reader warns; see `EFFECTS`.
 EDF_EFFECTS = {**EFFECTS, "background|flat.?field|dark|normali|correct|subtract|raster|log": 0}
-EDF_KNOWN = {name.lower() for key in EDF_KEYS for name in key.names}
 HIS_KEYS = (
     Key("FileType, HeaderSize", "applied", "of version 100"),
     Key("ULX, ULY, BRX, BRY", "refused", "equal rows and columns: RTK takes one for the other"),
@@ -172,11 +171,7 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
     numbers = (number_of(text, f"{file}: {name}") for name, text in times.items())
     exposed = {f"{1000 * time:.6g}" for time in numbers if time is not None}
     texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
-    unknown = [
-        f"{name}={value}"
-        for name, value in stated.items()
-        if name not in EDF_KNOWN and has_effect(name, value, EDF_EFFECTS)
-    ]
+    unknown = unknown_effects(stated, EDF_KEYS, EDF_EFFECTS)
     return kind, {name: [text] for name, text in texts.items() if text}, unknown
 
 

@@ -28,7 +28,8 @@ RIM_POINTS = 64
 MIN_SEEN_SHARE = 0.4
 #: Share of the grid's inscribed ellipsoid, or of a body, that may be poorly seen without a warning.
 MAX_POOR_SHARE = 0.05
-#: Distance from the middle of a single slice, in its thickness, that rays may have without one.
+#: Largest distance of rays from the middle of a single slice, as a share of its thickness, without
+#: a warning.
 MAX_ASIDE = 0.1
 #: The value of a detector's `pixels` or `pixel_mm` that fits it to the grid.
 FIT = "fit"

@@ -55,9 +55,9 @@ ASIDE = (0.81, 0.47, 0.35)
 #: Share of the lines at any one distance from the axis that are not measured, from which a warning
 #: is given: at the rim of a fan whose arc is 8 degrees short values are 2 % off.
 WARNED_MISSING = 0.01
-#: The same of all lines, where those missing are farther off than any that are measured: views cut
-#: an object that reaches there, which they warn of. A cube about the field of a square panel has
-#: 1 - cos of half the fan angle, 5 % of 18 degrees.
+#: The same of all lines, where those missing are farther off than any that are measured: an object
+#: that reaches there is cut in the views, for which there is another warning. Of a cube around the
+#: field of a square panel, 1 - cos of half the fan angle are missing: 5 % for 18 degrees.
 WARNED_BEYOND = 0.05
 #: Streaks of a disc half as wide as the grid, root mean square over the grid's cylinder relative to
 #: that of the disc, by half a turn's number of directions in which its edge is measured; and from

@@ -12,8 +12,8 @@ from mvrecon.core.files.keys import (
     EFFECTS,
     Key,
     check_keys,
-    has_effect,
     section_entries,
+    unknown_effects,
     warn_of_unknown,
 )
 from mvrecon.geometry.cameras.camera import Cameras
@@ -82,7 +82,6 @@ KEYS = (
 LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*(\d+)[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
 #: Entries of the section CTPro that count as those of XTekCT.
 CTPRO = ("shuttling", "anglefile_use")
-KNOWN = {name.lower() for key in KEYS for name in key.names}
 #: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
 NIKON_EFFECTS = {
     **EFFECTS,
@@ -134,14 +133,8 @@ def header(path: str | Path) -> Header:
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
-    unknown = [
-        f"{name}={value}"
-        for name, value in texts.items()
-        if name not in KNOWN
-        and value.lower() not in ("", *NO)
-        and has_effect(name, value, NIKON_EFFECTS)
-    ]
-    warn_of_unknown(path, unknown)
+    given = {name: value for name, value in texts.items() if value}
+    warn_of_unknown(path, unknown_effects(given, KEYS, NIKON_EFFECTS))
     return Header(path, texts)
 
 
