@@ -48,7 +48,7 @@ EFFECTS = {
     "unit(?!y)|calibrat|quanti(?!t)|unsigned|endian|logarithm|"
     "(?<![a-z])order(?![a-z])|(byte|ax[ei]s|dim[a-z]{0,20}|index|storage).?order": None,
 }
-#: Words of fields and texts beside images, which also state how the images were corrected or turned.
+#: Words of fields and texts beside images, which also state how these were corrected or turned.
 IMAGE_EFFECTS = {
     **EFFECTS,
     "flip|mirror|transpos|invert|revers|swap|polar_angle|tilt|"
