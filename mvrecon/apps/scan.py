@@ -451,13 +451,8 @@ def _detector(measured: MeasuredViews) -> dict[str, tuple]:
     if affine is None:
         pitch = measured.stack.pixel_mm
         return {"pixels": (rows, columns), **({"pixel_mm": pitch} if pitch else {})}
-    spacing = np.linalg.norm(affine[:3, :2], axis=0)
-    if not np.allclose(affine[:3, :2], np.eye(3, 2) * spacing, atol=1e-6 * spacing.min()):
-        raise Refused(
-            f"{measured.options.path}: expected views with columns along x and rows along y, got "
-            f"the direction {(affine[:3, :2] / spacing).T.round(6).tolist()}"
-        )
-    known = detector_of_image((columns, rows), spacing.tolist(), affine[:2, 3].tolist())
+    spacing = np.linalg.norm(affine[:3, :2], axis=0).tolist()
+    known = detector_of_image((columns, rows), spacing, affine[:2, 3].tolist())
     (v, u), (rows, columns) = known["offset_mm"], measured.flips
     offset = (v if rows else -v, -u if columns else u)
     return {**known, "offset_mm": offset}

@@ -107,7 +107,7 @@ META_EFFECTS = {
     "angle|euler|rotat|tilt|shear|direction|quaternion|matrix|affine|transform|translat|origin|"
     "axes|(?<!patient)(?<!patient_)(?<!com)(orient|position)": 0,
     "spacing|(voxel|pixel).?size|^skip|data.?offset": None,
-    "^NRRD_.*units": "mm",
+    "unit(?!y)": ("mm", "millimeter", "millimeters", "millimetre", "millimetres"),
     "^NRRD_old": math.nan,
 }
 #: MetaImage's types, and numpy's.

@@ -226,17 +226,20 @@ def check_fields(path: Path, group: h5py.Group, own: str) -> None:
                 _check_effect(path, group, name, field, f"field {name!r} beside {beside!r}")
 
 
-def fields_with_effect(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets in a group, and of links, that have a word of `effects`, and a value
-    that may change something; links are not followed.
+def fields_in(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
+    """Names of the data sets in a group that have at most one axis or a word of `effects`, and of
+    links with such a word, which are not followed; not those whose value is 0 or, as a gain of 1,
+    changes nothing.
     """
     found = []
     for name in group:
-        if has_effect(name, "", effects):
-            link = group.get(name, getlink=True)
-            field = group[name] if isinstance(link, h5py.HardLink) else link
-            group_of_its_own = isinstance(field, h5py.Group)
-            if not group_of_its_own and has_effect(name, _value(group, name, field), effects):
+        link = group.get(name, getlink=True)
+        field = group[name] if isinstance(link, h5py.HardLink) else link
+        word = has_effect(name, "", effects)
+        small = isinstance(field, h5py.Dataset) and field.ndim < 2
+        if (small or word) and not isinstance(field, h5py.Group):
+            value = _value(group, name, field)
+            if has_effect(name, value, effects) if word else value != 0:
                 found.append(name)
     return found
 

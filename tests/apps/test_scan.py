@@ -8,6 +8,7 @@ import torch
 from mvrecon.apps.reconstruct import read_scan
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.geometry.cameras.formats import rtk_xml
 from mvrecon.geometry.cameras.rigs import circular
@@ -122,11 +123,13 @@ def test_an_image_without_a_position_is_not_compared(tmp_path):
 
 
 def test_views_whose_file_mirrors_them_are_refused(tmp_path):
-    """Views in an MHA whose direction mirrors rows or columns are refused."""
+    """Views in an MHA whose direction mirrors rows or columns are refused, also in Python."""
     path = stack(tmp_path / "a.mha", torch.ones(4, 30, 36), (1.5, 2.0), (0.0, 0.0), (-1, 1))
     rtk_xml.write(circular(4, 200.0, 300.0, PLATE), tmp_path / "rig.xml")
-    with pytest.raises(Refused, match="expected views with columns along x and rows along y, got"):
-        read_scan(settings(path, rtk(tmp_path / "rig.xml")))
+    options = settings(path, rtk(tmp_path / "rig.xml"))
+    for read, what in ((read_scan, options), (open_projections, path)):
+        with pytest.raises(Refused, match="expected views with columns along x and rows along y"):
+            read(what)
 
 
 def test_an_offset_in_both_views_file_and_cameras_table_is_reported(tmp_path):

@@ -275,7 +275,7 @@ def test_pairs_of_nrrd_that_may_change_what_is_read_are_refused(line, tmp_path):
         with pytest.raises(Refused, match=key.partition(" = ")[0].replace("[", ".")):
             read_volume(meta(tmp_path / "a.mha", key))
     with warnings.catch_warnings(action="error"):
-        lines = ["NRRD_space units[0] = mm", "NRRD_old min = nan"]
+        lines = ["NRRD_space units[0] = mm", "NRRD_old min = nan", "SpacingUnits = mm"]
         assert places(meta(tmp_path / "a.mha", *lines)) == PLACED
 
 

@@ -38,7 +38,7 @@ class Key(NamedTuple):
 
 
 #: Words of unknown keys that change values, units or the order of values, and the value of such a
-#: key that does not.
+#: key, or the values, that change nothing.
 EFFECTS = {
     "(?<!gr[ae]y)scal(e|ing)(?!_?(types?|bar))|slope|factor|(?<!a)gain|multipl(?!ex)|exponent|"
     "conversion(?!.?(soft|script|prog))|coefficient": 1,
@@ -53,7 +53,8 @@ IMAGE_EFFECTS = {
     **EFFECTS,
     "flip|mirror|transpos|invert|revers|swap|polar_angle|tilt|"
     "(image|frame|detector|camera).?rotat": 0,
-    "(correct|subtract|normali[sz])ed|distort": 0,
+    "correct(ed|ion)|subtract|normali[sz]|distort|dark.?field|flat.?field|linear|"
+    "(?<![a-z])log(?=.?(appl|conv|corr|data|imag|intens|scal|transf))|fft": 0,
 }
 #: Values of any key with such a word that change nothing.
 OFF = ("no", "none", "off", "false", "unknown")
@@ -70,7 +71,10 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
     word of `effects`, and its value is not the one that changes nothing.
     """
     neutral = _neutral(name, effects)
-    return bool(neutral) and _plain(value) not in (_plain(neutral[-1]), *OFF)
+    if not neutral:
+        return False
+    values = neutral[-1] if isinstance(neutral[-1], tuple) else (neutral[-1],)
+    return _plain(value) not in (*map(_plain, values), *OFF)
 
 
 def mentions(text: str, effects: Mapping[str, Any] = EFFECTS) -> bool:
@@ -118,24 +122,27 @@ def check_unknown(
     warn_of_unknown(path, [name for name, _ in unknown if not _neutral(name, effects)])
 
 
-def unknown_names(names: Iterable[str], keys: Sequence[Key]) -> list[str]:
-    """Return the names that are in no key of a format, each once."""
+def unknown_names(names: Iterable[str], keys: Sequence[Key], case: bool = True) -> list[str]:
+    """Return the names that are in no key of a format, each once; without `case`, regardless of
+    case.
+    """
     patterns = (re.escape(name) for key in keys for name in key.names)
-    known = re.compile("|".join(patterns).replace(r"\*", ".*").replace(r"\?", "."))
+    words = "|".join(patterns).replace(r"\*", ".*").replace(r"\?", ".")
+    known = re.compile(words, 0 if case else re.IGNORECASE)
     return [name for name in dict.fromkeys(names) if not known.fullmatch(name)]
 
 
-def unknown_effects(
-    stated: Mapping[str, str], keys: Sequence[Key], effects: Mapping[str, Any]
-) -> list[str]:
-    """The keys, in lower case, that no key of a format has and that may change what is read, each
-    with its value.
+def unknown_entries(stated: Mapping[str, str], keys: Sequence[Key]) -> list[str]:
+    """Names of the entries of a header that are in no key of a format, regardless of case; not
+    those whose value is zero, empty, says that something is off, or, as a gain of 1, changes
+    nothing.
     """
-    known = {name.lower() for key in keys for name in key.names}
+    nothing = (0, *OFF, *NOTHING)
     return [
-        f"{name}={value}"
-        for name, value in stated.items()
-        if name not in known and has_effect(name, value, effects)
+        name
+        for name in unknown_names(stated, keys, case=False)
+        if _plain(stated[name]) not in nothing
+        and (not _neutral(name, EFFECTS) or has_effect(name, stated[name]))
     ]
 
 

@@ -100,6 +100,16 @@ NAMED = re.compile(
     r"\b(?:name|key)\s*=\s*[\"']([^\"'<>]{1,60})[\"'][^<>]{0,200}?(?:value\s*=\s*[\"']|>\s*)"
     r"([^\"'<>]{1,200})"
 )
+PAIR = re.compile(r"<(?:name|key)>\s*([^<>]{1,60}?)\s*</\w+>\s*<[\w:.-]{1,60}>\s*([^<>]{1,200})</")
+#: Characters of a line of prose that are named, and words by which it states what was done to grey
+#: values.
+PROSE_SHOWN = 80
+PROSE = re.compile(
+    r"(?<![<\w])(scaled|multiplied|divided|subtract(ed|ion)|correct(ed|ion)|normali[sz](ed|ation)|"
+    r"flipped|mirrored|rotated|transposed|inverted|linearised|linearized|logarithms?|"
+    r"log.transform(ed)?|optical densit(y|ies))\b",
+    re.IGNORECASE,
+)
 #: Names of scales of the display, of stages and lenses; and units of other things than values.
 OF_DISPLAY = re.compile(
     r"spatial|^stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|"
@@ -126,17 +136,25 @@ def without_own_id(text: str) -> str:
 @lru_cache(maxsize=32)
 def effects(text: str) -> list[str]:
     """Names of the entries of a text that may change values: lines of a name and a value, JSON,
-    XML; none of OME's and MetaMorph's texts, whose entries are of the display and the microscope.
+    XML; and the starts of lines of prose with a word of `PROSE`. None of OME's and MetaMorph's
+    texts, whose entries are of the display and the microscope.
     """
-    if not mentions(text, IMAGE_EFFECTS) or OME.search(text) or text.startswith("<MetaData"):
+    if OME.search(text) or text.startswith("<MetaData"):
         return []
     known = {name for program, name in KNOWN if program == "Dectris" or program in text}
-    lines = [x for x in LINE.sub("", text).splitlines() if mentions(x, IMAGE_EFFECTS)]
-    found = [pair for line in lines for pair in ENTRY.findall(line)]
-    for pattern in (LINE, ELEMENT, NAMED):
+    lines = LINE.sub("", text).splitlines()
+    parts = [(x, ENTRY.findall(x) if mentions(x, IMAGE_EFFECTS) else []) for x in lines]
+    found = [pair for _, pairs in parts for pair in pairs]
+    for pattern in (LINE, ELEMENT, NAMED, PAIR):
         found += pattern.findall(text)
+    prose = {
+        line.strip()[:PROSE_SHOWN]
+        for line, pairs in parts
+        if PROSE.search(line) and not any(mentions(name, IMAGE_EFFECTS) for name, _ in pairs)
+    }
     return sorted(
-        {
+        prose
+        | {
             name.strip()
             for name, value in found
             if name.strip() not in known

@@ -35,6 +35,8 @@ from mvrecon.data.projections.tiff import tiff_header, tiff_pages
 
 #: Formats of image files by their ending; others may be DICOM.
 ENDINGS = {".tif": "TIFF", ".tiff": "TIFF", ".png": "PNG", **rtk_images.ENDINGS}
+#: The file beside images in which CIL stores their scale and offset.
+CIL_SCALES = "scaleoffset.json"
 #: Files below a folder without images that are looked at, to name the folder that has some.
 LOOKED_AT = 1000
 #: Names of dark and flat fields among the views: Octopus numbers them as di0001 and io0001; the
@@ -172,8 +174,13 @@ def view_files(
 
     Raises:
         Refused: no image, too many, or of several formats; DICOM images of several series, or only
-        some with their own InstanceNumber; see `ordered`.
+        some with their own InstanceNumber; CIL's scale beside them; see `ordered`.
     """
+    if (scales := folder / CIL_SCALES).exists():
+        raise Refused(
+            f"{scales}: expected images with their own values, got CIL's scale and offset; write "
+            f"the images without compression, or remove the file if they were applied"
+        )
     excluded = {field.resolve() for field in fields}
     images = [file for file in _images(folder, pattern) if file.resolve() not in excluded]
     views = [f for f in images if not any(x.match(f.name) for x in FIELDS.values())] or images

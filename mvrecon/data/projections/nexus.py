@@ -42,7 +42,7 @@ from mvrecon.data.projections.nexus_detector import (
     there,
 )
 from mvrecon.data.projections.stack import Hdf5Views, ProjectionStack
-from mvrecon.data.storage import fields_with_effect, held, opened
+from mvrecon.data.storage import fields_in, held, opened
 
 EXPECTED = (
     "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
@@ -118,9 +118,22 @@ KEYS = (
     Key("field_of_view, estimated_cor_from_motor, x_rotation_axis_pixel_position", "ignored", AXIS),
     Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
     Key(
-        "calibration_date, angular_calibration, azimuthal_angle, trigger_*, raw_time_of_flight",
+        "calibration_date, angular_calibration, azimuthal_angle, trigger_*, raw_time_of_flight, "
+        "description, serial_number, local_name, type, layout, input, crate, slot, diameter, "
+        "solid_angle, efficiency, gas_pressure, detection_gas_path, sensor_*, detector_number, "
+        "acquisition_mode, number_of_cycles, frame_time, frame_start_number, real_time, "
+        "start_time, stop_time, detector_readout_time, tomo_n",
         "ignored",
-        "not of values",
+        "of a detector of NeXus: not of values",
+    ),
+    Key(
+        "name, title, short_title, chemical_formula, situation, preparation_date, temperature, "
+        "*_field, pressure, humidity, changer_position, unit_cell*, sample_orientation, "
+        "orientation_matrix, ub_matrix, mass, density, relative_molecular_mass, concentration, "
+        "volume_fraction, scattering_length_density, space_group, point_group, path_length*, "
+        "component, sample_component, external_DAC, propagation_distance",
+        "ignored",
+        "of a sample of NeXus: not of places",
     ),
     Key(
         "flatfield, dead_time, countrate_correction_lookup_table",
@@ -381,17 +394,29 @@ class _Layout(NamedTuple):
             rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
-        self._warn_of_moves(keys, pixel)
+        below = [*nexus_axes.translations_below(self.angles)] if self.angles else []
+        self._warn_of_moves(keys, pixel, below)
         limits = limits_of(self.detector, frames, keys)
-        unknown = [*self._unknown_fields(), *(n for p in angles for n in unknown_attributes(p))]
+        unknown = [
+            *self._unknown_fields(below),
+            *(n for p in angles for n in unknown_attributes(p)),
+        ]
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
 
-    def _unknown_fields(self) -> list[str]:
-        """Data sets beside the frames that no key knows, and that may change them."""
-        path, name, _ = self.detector or self.frames
-        group = name if self.detector else name.rpartition("/")[0] or "/"
-        with opened(path) as file:
-            return unknown_names(fields_with_effect(file[group], FIELD_EFFECTS), KEYS)
+    def _unknown_fields(self, below: Sequence[Place]) -> list[str]:
+        """Data sets beside the frames and beside the angles that no key knows, but those on which
+        the angles depend.
+        """
+        data_sets = [self.frames, *([] if self.angles is None else [self.angles])]
+        groups = {(one.path, one.name.rpartition("/")[0] or "/") for one in data_sets}
+        if self.detector:
+            groups.add(self.detector[:2])
+        found: list[str] = []
+        for path, group in sorted(groups):
+            with opened(path) as file:
+                found += fields_in(file[group], FIELD_EFFECTS)
+        stages = {place.name.rpartition("/")[2] for place in below}
+        return [name for name in unknown_names(found, KEYS) if name not in stages]
 
     def _keys(self, count: int) -> np.ndarray:
         """The image_key of each of so many frames; all are views without one."""
@@ -411,9 +436,10 @@ class _Layout(NamedTuple):
             )
         return keys
 
-    def _warn_of_moves(self, keys: np.ndarray, pixel: tuple[float, float] | None) -> None:
+    def _warn_of_moves(
+        self, keys: np.ndarray, pixel: tuple[float, float] | None, below: Sequence[Place]
+    ) -> None:
         """Warn of translations of the sample between views, by more than a part of a pixel."""
-        below = nexus_axes.translations_below(self.angles) if self.angles else ()
         for place in dict.fromkeys((*self.moves, *below)):
             moved = values_at(place, ("units", *nexus_axes.ATTRIBUTES)).ravel()
             views = moved[keys == VIEW] if len(moved) == len(keys) else moved[:0]

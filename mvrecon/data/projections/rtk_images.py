@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_declared, io_library
-from mvrecon.core.files.keys import EFFECTS, Key, check_keys, unknown_effects
+from mvrecon.core.files.keys import Key, check_keys, unknown_entries
 from mvrecon.data.projections.exposures import number_of
 from mvrecon.data.projections.stack import Header
 
@@ -47,11 +47,21 @@ EDF_KEYS = (
     Key("Dummy", "refused", "its pixels are bad: replace them, and give views.bad_pixels"),
     Key(", ".join(EDF_TIMES), "compared", "of views and flat fields, as ExposureTime, from s"),
     Key("counter_mne, counter_pos", "compared", "the ring's current srcur, as ExposureTime"),
-    Key("optic_used", "ignored", "of no stated unit; the pixel size is asked for"),
+    Key("optic_used, PSize_*", "ignored", "the pixel size is asked for"),
+    Key("Size, HeaderID, EDF_*, VersionNumber, Image", "ignored", "of the file"),
+    Key(
+        "Center_*, SampleDistance, WaveLength, energy, motor_mne, motor_pos",
+        "ignored",
+        "the camera decides",
+    ),
+    Key(
+        "title, run, scan_*, acq_*, point_no, preset, dir, prefix, suffix, date, time, time_of_*, "
+        "machine*, cutoffenergy, fill_mode",
+        "ignored",
+        "of the scan",
+    ),
     Key("image_flip, image_rotation", "ignored", "of the camera, which applied them"),
 )
-#: Words of unknown keys of EDF that change values, of which a reader warns; see `EFFECTS`.
-EDF_EFFECTS = {**EFFECTS, "background|flat.?field|dark|normali|correct|subtract|raster|log": 0}
 HIS_KEYS = (
     Key("FileType, HeaderSize", "applied", "of version 100"),
     Key("ULX, ULY, BRX, BRY", "refused", "equal rows and columns: RTK takes one for the other"),
@@ -142,8 +152,8 @@ def _itk(file: Path) -> Any:
 
 
 def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
-    """The type of the pixels, the exposure by the names in the header, and unknown keys that may
-    change values; raises Refused for `EDF_KEYS` to refuse.
+    """The type of the pixels, the exposure by the names in the header, and keys that mvrecon does
+    not know; raises Refused for `EDF_KEYS` to refuse.
     """
     with file.open("rb") as raw:
         text = raw.read(EDF_HEADER)
@@ -171,7 +181,7 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
     numbers = (number_of(text, f"{file}: {name}") for name, text in times.items())
     exposed = {f"{1000 * time:.6g}" for time in numbers if time is not None}
     texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
-    unknown = unknown_effects(stated, EDF_KEYS, EDF_EFFECTS)
+    unknown = unknown_entries(stated, EDF_KEYS)
     return kind, {name: [text] for name, text in texts.items() if text}, unknown
 
 

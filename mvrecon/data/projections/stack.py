@@ -297,6 +297,7 @@ class ItkViews(ProjectionStack):
 
     Raises:
         ImportError, FileNotFoundError, Refused: see `mvrecon.data.itk.itk_image`.
+        Refused: columns that do not run along x, or rows that do not run along y.
     """
 
     def __init__(self, path: Path):
@@ -307,8 +308,13 @@ class ItkViews(ProjectionStack):
         affine = self._image.affine
         if not np.array_equal(affine[:2, [0, 1, 3]], np.eye(2, 3)):  # ITK's default
             self.affine = affine
-            right, down = np.linalg.norm(affine[:3, :2], axis=0).tolist()
-            self.pixel_mm = (down, right)
+            right, down = spacing = np.linalg.norm(affine[:3, :2], axis=0)
+            if not np.allclose(affine[:3, :2], np.eye(3, 2) * spacing, atol=1e-6 * spacing.min()):
+                raise Refused(
+                    f"{path}: expected views with columns along x and rows along y, got the "
+                    f"direction {(affine[:3, :2] / spacing).T.round(6).tolist()}"
+                )
+            self.pixel_mm = (float(down), float(right))
 
     def _block(self, first: int, last: int) -> np.ndarray:
         return self._image.read(first, last)

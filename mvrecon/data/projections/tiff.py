@@ -60,6 +60,7 @@ TIFF_KEYS = (
         (1,),
     ),
     Key("NewSubfileType", "refused", "full images, not thumbnails or masks", (0, 2)),
+    Key("scaleoffset.json", "refused", "CIL's, beside the images: store the values that it gives"),
     Key("GrayResponseCurve", "refused", "store the values that the curve gives"),
     Key("TransferFunction", "refused", "store the values that the function gives"),
     Key("LinearizationTable", "refused", "store the values that the table gives"),

@@ -164,9 +164,9 @@ def test_images_of_another_size_are_refused(tmp_path):
         opened(xtekct(tmp_path))
 
 
-def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_path):
-    """Levels, gains, tilts, shifts, directions and paths of unknown names, but not entries of
-    Nikon's own volume, nor those that say nothing.
+def test_unknown_entries_are_warned_of(tmp_path):
+    """Levels, gains, tilts, shifts, directions, paths and any other, but not the entries of public
+    files of Nikon's, nor those that say nothing.
     """
     for name, value in {
         **{"BlackLevel": 500, "GreyOffset": 9, "GainCorrection": 2, "DetectorTilt": 3},
@@ -174,9 +174,9 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
         **{"RotationDirection": "CW", "FlipHorizontal": "True", "AngularUnits": "rad"},
         **{"PixelBinning": 2, "HelixPitch": 10, "ZStep": 0.3, "ConveyorSpeed": 5},
         **{"ScanType": "Helical", "IncrementalAngle": -60, "StartAngle": 90},
-        **{"ReversedImages": "True", "DetectorBinning": "2x2"},
+        **{"ReversedImages": "True", "DetectorBinning": "2x2", "PanelSkew": 2, "LogImages": 1},
     }.items():
-        with pytest.warns(UserWarning, match=f"know: {name.lower()}={value};"):
+        with pytest.warns(UserWarning, match=f"know: {name.lower()};"):
             nikon.read(xtekct(tmp_path, **{name: value}))
     own = {"OffsetZ": 4, "Scaling": 1000, "OutputUnits": "/m", "TIFFScaling": 1, "Scale": 1.32}
     own |= {"AutomaticCentreOfRotation": 1, "AutoScalingType": 2, "ImportConversion": 1}
@@ -184,7 +184,8 @@ def test_unknown_entries_that_may_change_values_or_geometry_are_warned_of(tmp_pa
     own |= {"FluxNormalisation": 0, "FramesPerProjection": 4, "Increment": 1, "OrderFFT": 3}
     own |= {"VirtualDetectorPixelsX": 6, "SrcToVirtualDetector": 400.0, "Blanking": 0}
     own |= {"AutomaticCentreOfRotationMaskRadius": 3.0, "OperatorID": "a", "OutputDigits": 4}
-    own |= {"DetectorName": "Varex", "DetectorBinning": 1}
+    own |= {"DetectorBinning": 0, "LowPercentile": 0.2, "VoxelSizeY": 0.1, "RegionPixelsY": 4}
+    own |= {"MedianFilterKernelSize": 1, "BeamHardeningLUTFile": "a.lut", "CoefX1": 0.75}
     with warnings.catch_warnings(action="error"):
         for none in ("", "none", "NONE"):
             own |= {"AngleFile": none}
@@ -199,7 +200,7 @@ def test_entries_of_ctpro_count_as_those_of_the_scan(tmp_path):
     with pytest.raises(Refused, match="expected Shuttling"):
         nikon.read(path)
     path.write_text(f"{own}AngleFile_Use=True\r\n", "latin-1")
-    with pytest.warns(UserWarning, match="anglefile_use=True"):
+    with pytest.warns(UserWarning, match="know: anglefile_use;"):
         nikon.read(path)
     path.write_text(f"{own}AngleFile_Use=False\r\nVoxelScalingFactor=2\r\n", "latin-1")
     with warnings.catch_warnings(action="error"):

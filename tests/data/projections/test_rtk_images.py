@@ -262,23 +262,24 @@ def test_times_of_edf_that_are_no_numbers_are_warned_of(text, tmp_path):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
+        *(("BSize_1", 2), ("Skew", "left")),
         *(("gain", 2), ("DataOffset", 100), ("FlatField", "Corrected"), ("Units", "1/mm")),
         *(("conversions", "x-CBF_BYTE_OFFSET"), ("BackgroundCorrectionConstant", 0.002)),
     ],
 )
-def test_keys_of_edf_that_may_change_values_are_found(name, value, tmp_path):
+def test_unknown_keys_of_edf_are_found(name, value, tmp_path):
     """Not a gain of 1, nor those of the ESRF's cameras."""
     own = {"image_flip": "<flip x : False,flip y : False>", "image_rotation": "Rotation_0"}
     own |= {"Offset_1": 0, "PSize_1": 1e-6, "motor_mne": "sx sy", "acq_mode": "Single", "gain": 1}
     edf(tmp_path / "a.edf", grey(20_000)[0].astype("u2"), **{**own, name: value})
-    assert rtk_images._check_edf(tmp_path / "a.edf")[2] == [f"{name.lower()}={value}"]
+    assert rtk_images._check_edf(tmp_path / "a.edf")[2] == [name.lower()]
 
 
 def test_a_long_header_of_edf_is_read_without_a_wait(tmp_path):
     """Of a key without a value, and of a name with a hyphen."""
     values = grey(20_000)[0].astype("u2")
     edf(tmp_path / "a.edf", values, **{"my-gain": "2 ;\n" + "a" * 60_000})
-    assert rtk_images._check_edf(tmp_path / "a.edf")[2] == ["my-gain=2"]
+    assert rtk_images._check_edf(tmp_path / "a.edf")[2] == ["my-gain"]
 
 
 @needs_rtk

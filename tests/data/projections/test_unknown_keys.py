@@ -114,6 +114,13 @@ TEXTS = {
     "Slope\t2\nIntercept\t0": ["Slope"],
     "<a><slope>0.5</slope><b offset='3'/></a>": ["b offset", "slope"],
     '<a><Item name="scale">3</Item><p name="gain" value="4"/></a>': ["gain", "scale"],
+    "<e><name>slope</name><value>2</value><key>gain</key>\n<real>1</real></e>": ["slope"],
+    "flat-field corrected by the camera": ["flat-field corrected by the camera"],
+    "Values in optical density": ["Values in optical density"],
+    "1.5 mm of aluminium\ndivided by the ring's current": ["divided by the ring's current"],
+    "Normalization: none": [],
+    "Normalization: by the ring current": ["Normalization"],
+    "log file: scan.log\nlog_scaled=1": ["log_scaled"],
     "unit=mm": [],
     "Scale bar: 100 um\nCalibration date: 2020-05-01\nGain: 1": [],
     "Date: 2020-05-01\nPixel scale: 2\nUpdated gain: 3": ["Pixel scale", "Updated gain"],
@@ -130,6 +137,13 @@ TEXTS = {
 def test_entries_of_a_description_that_may_change_values_are_named(text, tmp_path):
     found = named(tiffs(tmp_path, text=text), **GIVEN)
     assert found == [f"ImageDescription: {name}" for name in TEXTS[text]]
+
+
+def test_the_scale_that_cil_stores_beside_compressed_images_is_refused(tmp_path):
+    """As its TIFFWriter writes it."""
+    (tiffs(tmp_path) / "scaleoffset.json").write_text('{"scale": 21.2, "offset": 0.5}')
+    with pytest.raises(Refused, match="scaleoffset.json: expected images with their own values"):
+        opened(tmp_path, **GIVEN)
 
 
 def test_the_texts_of_a_detector_of_dectris_are_known(tmp_path):
@@ -261,6 +275,10 @@ FIELDS = {
         [],
     ),
     "another axis": ({"time_of_flight": np.arange(9.0)}, ["time_of_flight"]),
+    "names without such a word": (
+        {"is_fft_shifted": True, "binning_x": 2, "magnification": 4.0, "rotation": 90, "skew": 0},
+        ["binning_x", "is_fft_shifted", "magnification", "rotation"],
+    ),
 }
 
 
@@ -272,7 +290,8 @@ def test_fields_of_a_detector_that_may_change_its_frames_are_named(case, tmp_pat
 
 
 def test_other_names_of_a_scan_in_hdf5_are_named(tmp_path):
-    """Of the angles; of the parts of virtual frames, and of sinograms by any name."""
+    """Of angles, of the sample, of the parts of virtual frames, and of sinograms by any name."""
+    assert named(tomo(tmp_path / "t.nxs", sample__tilt=2.0, sample__mass=3.0)) == ["tilt"]
     path = tomo(tmp_path / "a.nxs")
     with h5py.File(path, "a") as file:
         file["entry/sample/rotation_angle"].attrs.update(direction="cw", long_name="theta")

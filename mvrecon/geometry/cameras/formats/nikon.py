@@ -9,11 +9,10 @@ import torch
 
 from mvrecon.core.files.checks import Refused, check_file, file_errors, text_of
 from mvrecon.core.files.keys import (
-    EFFECTS,
     Key,
     check_keys,
     section_entries,
-    unknown_effects,
+    unknown_entries,
     warn_of_unknown,
 )
 from mvrecon.geometry.cameras.camera import Cameras
@@ -60,36 +59,30 @@ KEYS = (
     Key("FramesPerProjection", "ignored", "WhiteLevel is that of the averaged images"),
     Key("Scattering", "refused", "of Nikon's own reconstruction", (0,)),
     Key(
-        "VoxelsX, VoxelSizeX, OffsetX, MaskRadius, RegionStartX, RegionPixelsX",
+        "Voxels*, VoxelSize*, OffsetX, OffsetY, OffsetZ, MaskRadius, Region*",
         "ignored",
         "grid has the voxels",
     ),
-    Key("CoefX4, CoefX3, CoefX2, CoefX1, CoefX0, Scale", "ignored", "its beam hardening presets"),
-    Key("FilterType, CutOffFrequency, Exponent, Normalisation", "ignored", "its filter"),
+    Key("CoefX*, Scale, BeamHardening*", "ignored", "its beam hardening presets"),
     Key(
-        "OffsetY, OffsetZ, Scaling, OutputUnits, TIFFScaling, ImportConversion, AutoScalingType, "
-        "ScalingMinimum, ScalingMaximum, AutomaticCentreOfRotation, "
-        "AutomaticCentreOfRotationOffsetZ1, AutomaticCentreOfRotationOffsetZ2, "
-        "AutomaticCentreOfRotationMaskRadius, Increment, VirtualDetectorPixelsX, "
-        "VirtualDetectorPixelsY, VirtualDetectorPixelSizeX, VirtualDetectorPixelSizeY, "
-        "VirtualDetectorOffsetX, VirtualDetectorOffsetY, SrcToVirtualDetector",
+        "FilterType, CutOffFrequency, Exponent, Normalisation, InterpolationType, *KernelSize, "
+        "OrderFFT, DerivativeType, Blanking, Increment",
+        "ignored",
+        "of its own reconstruction",
+    ),
+    Key(
+        "Output*, Scaling*, AutoScalingType, TIFFScaling, ImportConversion, *Percentile, "
+        "TimeStampFolder, AutomaticCentreOfRotation*, VirtualDetector*, SrcToVirtualDetector",
         "ignored",
         "of its volume",
     ),
-    Key("XraykV, XrayuA", "ignored", "the tube"),
+    Key("OperatorID, ModifierID, InputName, InputDigits, Version, Product", "ignored", "texts"),
+    Key("XraykV, XrayuA, Filter_*", "ignored", "the tube and its filter"),
 )
 #: A line of measured angles: number of the projection and degrees; share by which steps may differ.
 LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*(\d+)[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
 #: Entries of the section CTPro that count as those of XTekCT.
 CTPRO = ("shuttling", "anglefile_use")
-#: Words of unknown keys that change grey values or geometry, of which a reader warns; no effect.
-NIKON_EFFECTS = {
-    **EFFECTS,
-    "level|tilt|roll|pitch|yaw|shift|step|angle|increment|direction|clockwise|rotat|revers|distort|"
-    "invert|lineari[sz]|correct|focal.?spot|angular.?range|"
-    "(object|detector)(?!.?(name|model|serial|manufact|descr))|heli|spiral|conveyor|scan.?type": 0,
-    "binn": 1,
-}
 
 
 class Header(NamedTuple):
@@ -117,7 +110,7 @@ def header(path: str | Path) -> Header:
     """Read the file's entries.
 
     Warns:
-        UserWarning: unknown entries that may change grey values or geometry.
+        UserWarning: entries that mvrecon does not know.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -133,8 +126,7 @@ def header(path: str | Path) -> Header:
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
-    given = {name: value for name, value in texts.items() if value}
-    warn_of_unknown(path, unknown_effects(given, KEYS, NIKON_EFFECTS))
+    warn_of_unknown(path, unknown_entries(texts, KEYS))
     return Header(path, texts)
 
 
