@@ -40,14 +40,9 @@ def phantom(rng, radius, height):
     body = torch.cat([draw(0.6, 0.9, 2) * radius, torch.tensor([10 * height])])
     angle, far = draw(0, 2 * math.pi, 8), draw(0, 0.5, 8) * radius
     centres = torch.stack([far * angle.cos(), far * angle.sin(), draw(-0.3, 0.3, 8) * height], 1)
-    radii, turn = draw(0.04, 0.2, 8, 3) * radius, torch.eye(3, dtype=torch.float64)
-    first = turn[None], torch.zeros(1, 3).double()
-    return Phantom(
-        (
-            Solids("cylinder", first[1], first[0], body[None], torch.tensor([1.2 / radius])),
-            Solids("ellipsoid", centres, turn.expand(8, 3, 3), radii, draw(-0.8, 2, 8) / radius),
-        )
-    )
+    radii, values = draw(0.04, 0.2, 8, 3) * radius, draw(-0.8, 2, 8) / radius
+    outer = Solids.upright("cylinder", torch.zeros(1, 3), body[None], torch.tensor([1.2 / radius]))
+    return Phantom((outer, Solids.upright("ellipsoid", centres, radii, values)))
 
 
 def scan(beam, arc, seed):

@@ -93,10 +93,8 @@ def from_balls(views):
     ideal = mv.circular(views, 400.0, 600.0, plate)
     rig = perturbed(ideal, offset_px=2.0, tilt_degrees=1.0, source_mm=1.0, seed=1)
     markers = helix(20, 30.0, 60.0, 1.7)
-    turn = torch.eye(3, dtype=torch.float64).expand(len(markers), 3, 3)
-    radii = torch.full((len(markers), 3), 1.5, dtype=torch.float64)
-    values = torch.full((len(markers),), 0.3, dtype=torch.float64)
-    phantom = Phantom((Solids("ellipsoid", markers, turn, radii, values),))
+    radii, values = torch.full_like(markers, 1.5), torch.full_like(markers[:, 0], 0.3)
+    phantom = Phantom((Solids.upright("ellipsoid", markers, radii, values),))
     integrals = phantom.integrals(*rig.refined(3).rays()).float()
     exact = torch.nn.functional.avg_pool2d(integrals, 3)[None, None]
     for photons, seed in NOISE:

@@ -6,17 +6,17 @@ python experiments/14_counts/recovery.py OUT_FOLDER
 A folder with the first table gets the picture of it alone.
 """
 
-import csv
 import math
 import sys
 import time
 from pathlib import Path
 
 import torch
+from matplotlib import pyplot
 from torch.nn.functional import avg_pool2d
 
 import mvrecon as mv
-from mvrecon.core.files.runs import VERSIONS, write_rows
+from mvrecon.core.files.runs import VERSIONS, read_rows, write_rows
 from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.training.run_folder import versions
@@ -57,10 +57,9 @@ def ring(radius: float, count: int, z: float = 0.0, start: float = 0.0) -> torch
 
 def cylinder(spheres: torch.Tensor) -> Phantom:
     """Hot spheres in a warm cylinder of radius 72 mm and height 80 mm."""
-    turns, radii = torch.eye(3).expand(4, 3, 3), (DIAMETERS / 2)[:, None].expand(4, 3)
-    size = torch.tensor([[72.0, 72.0, 40.0]])
-    body = Solids("cylinder", torch.zeros(1, 3), turns[:1], size, torch.ones(1))
-    return Phantom((body, Solids("ellipsoid", spheres, turns, radii, torch.full((4,), RATIO - 1))))
+    radii, size = (DIAMETERS / 2)[:, None].expand(4, 3), torch.tensor([[72.0, 72.0, 40.0]])
+    body = Solids.upright("cylinder", torch.zeros(1, 3), size, torch.ones(1))
+    return Phantom((body, Solids.upright("ellipsoid", spheres, radii, torch.full((4,), RATIO - 1))))
 
 
 def counted(phantom: Phantom, A: Spect, seed: int) -> tuple[torch.Tensor, float]:
@@ -139,17 +138,12 @@ def spreads(A: Spect, draws: int = 20) -> list[dict]:
 
 def draw(rows: list[dict], file: Path) -> None:
     """Recovery over variability of two spheres, and over the processor's time."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     figure = pyplot.figure(figsize=(8, 6.4), layout="constrained")
     axes = list(figure.subplot_mosaic("AB;CC").values())
     for name in METHODS:
         lines = [r for r in rows if r["method"] == name]
         for axis, diameter in zip(axes, (13.0, 22.0), strict=False):
-            points = [r for r in lines if r["sphere_mm"] == diameter]
+            points = [r for r in lines if float(r["sphere_mm"]) == diameter]
             pairs = [(float(r["variability"]), float(r["recovery"])) for r in points]
             axis.plot(*zip(*pairs, strict=True), ".-", label=TOLD[name])
             axis.set(xlabel="background variability", ylabel="contrast recovery")
@@ -179,8 +173,6 @@ def main(out: Path) -> None:
 
 if __name__ == "__main__":
     if (table := Path(sys.argv[1]) / "recovery.csv").exists():  # the picture of the table
-        with table.open() as file:
-            kept: list[dict] = list(csv.DictReader(file))
-        draw([r | {"sphere_mm": float(r["sphere_mm"])} for r in kept], table.with_suffix(".png"))
+        draw(read_rows(table), table.with_suffix(".png"))
     else:
         main(Path(sys.argv[1]))

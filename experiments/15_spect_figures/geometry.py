@@ -32,7 +32,7 @@ def ball(radius: float, centre=(0.0, 0.0, 0.0), value: float = 1.0) -> Phantom:
     """A uniform ball; mm."""
     place = torch.as_tensor(centre, dtype=torch.float64)[None]
     size, values = torch.full((1, 3), radius), torch.tensor([value])
-    return Phantom((Solids("ellipsoid", place, torch.eye(3)[None], size, values),))
+    return Phantom((Solids.upright("ellipsoid", place, size, values),))
 
 
 def counts_of(phantom: Phantom, cameras: mv.Cameras, diameter: float) -> torch.Tensor:

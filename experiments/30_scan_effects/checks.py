@@ -59,8 +59,7 @@ def ellipsoids(rng: torch.Generator, high: bool, wider: float = 1.0) -> Phantom:
         radii = [FIELD * uniform(rng, 0.06, 0.25) for _ in "xyz"]
         parts.append((x, y, uniform(rng, -15, 15), *radii, uniform(rng, -0.015, 0.03)))
     x, scale = torch.tensor(parts).double(), torch.tensor([wider, wider, 1.0]).double()
-    turns = torch.eye(3).double().expand(len(x), 3, 3)
-    return Phantom((Solids("ellipsoid", scale * x[:, :3], turns, scale * x[:, 3:6], x[:, 6]),))
+    return Phantom((Solids.upright("ellipsoid", scale * x[:, :3], scale * x[:, 3:6], x[:, 6]),))
 
 
 def views_of(phantom: Phantom, rig: mv.Cameras) -> torch.Tensor:
