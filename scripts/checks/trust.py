@@ -17,8 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.runs import VERSIONS, write_rows
+from mvrecon.core.files.runs import VERSIONS, read_rows, write_rows
 from mvrecon.training.run_folder import versions
+from mvrecon_bench.runner import TABLE
 from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, PASS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,7 +39,7 @@ def stress(_: argparse.Namespace) -> Rows:
     """The stress plan: the verdicts on each part, and the cases in which it failed."""
     with tempfile.TemporaryDirectory() as folder:
         output_of(sys.executable, "-m", "mvrecon_bench.stress", f"out={folder}/stress")
-        rows = json.loads((Path(folder) / "stress" / "verdicts.json").read_text())
+        rows = read_rows(Path(folder) / "stress" / TABLE)
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         names = {"part": row["part"], "dtype": row["dtype"]}
@@ -46,7 +47,7 @@ def stress(_: argparse.Namespace) -> Rows:
         part = found.setdefault((row["part"], row["dtype"]), empty)
         part[row["verdict"]] += 1
         if row["verdict"] == FAIL:
-            part["failed"] += f"{row['number']:.0f} {row['case']}; "
+            part["failed"] += f"{row['number']} {row['case']}; "
     return list(found.values())
 
 

@@ -52,10 +52,8 @@ class Bench(ABC):
         """Short label of a row's part."""
 
     @abstractmethod
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
-        """Yield a row for each job of a group; `rows` are existing rows, `say` reports progress."""
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
+        """Yield a row for each job of a group; `say` reports progress."""
 
     def summary(self, rows: Sequence[Row], folder: Path) -> str:
         """Write the plots (PNG) to the folder and return what precedes the tables, in Markdown."""

@@ -62,7 +62,7 @@ def run(bench: Bench, folder: Path, settings: dict[str, Any] | None = None) -> l
                 progress.update(task, description=text)
 
             for jobs in filter(None, groups):
-                for new in bench.measure(jobs, table.rows, say):
+                for new in bench.measure(jobs, say):
                     row = table.append(new)
                     for name in bench.charts:
                         if isinstance(figure := row.get(name), float):

@@ -73,9 +73,7 @@ class Precision(Bench):
     def label(self, row: Row) -> str:
         return f"{row['task']} {row['precision']}"
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """The rows of a task; all of its precisions are timed, since only alternate timings are
         comparable.
         """

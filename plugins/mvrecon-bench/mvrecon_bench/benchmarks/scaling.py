@@ -1,6 +1,7 @@
 """`bench=scaling`: time against the amount of work, with fitted exponents."""
 
 import math
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,9 +113,7 @@ class Scaling(Bench):
     def label(self, row: Row) -> str:
         return f"{part_label(row)}, {row['axis']}"
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """Yield the rows of the points on one axis."""
         trials: list[tuple[Point, Trial, Row]] = []
         for job in jobs:
@@ -128,7 +127,7 @@ class Scaling(Bench):
             calls, first = {}, {}
             for key, (point, trial, _) in enumerate(trials):
                 with threads(point.threads):
-                    if trial.attempt(call, 0.0, math.inf, math.inf) is not None:
+                    if trial.attempt(call, math.inf) is not None:
                         calls[key] = threads(point.threads)(getattr(trial, call))
                         first[key] = trial.seconds[call]
             timings = interleaved(calls, first, self.repeats, jobs[0].subject.device)
@@ -175,11 +174,11 @@ def exponent(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
     NaN for too few points: p requires two different amounts of work, its error three.
     """
-    x, y = (torch.tensor(values, dtype=torch.float64).log() for values in zip(*points, strict=True))
-    x, y = x - x.mean(), y - y.mean()
-    spread = x.square().sum()
-    if not spread > 0:
+    work, ms = ([math.log(value) for value in values] for values in zip(*points, strict=True))
+    if len(set(work)) < 2:
         return math.nan, math.nan
-    p = (x * y).sum() / spread
-    left = (y - p * x).square().sum() / max(len(points) - 2, 1)
-    return p.item(), (left / spread).sqrt().item() if len(points) > 2 else math.nan
+    p, start = statistics.linear_regression(work, ms)
+    if len(points) < 3:
+        return p, math.nan
+    left = sum((y - start - p * x) ** 2 for x, y in zip(work, ms, strict=True))
+    return p, math.sqrt(left / (len(points) - 2) / (len(points) - 1) / statistics.variance(work))

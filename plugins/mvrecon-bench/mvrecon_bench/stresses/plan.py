@@ -1,13 +1,11 @@
 """The stress plan: every case with every applicable part, run row by row as a benchmark."""
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.atomic import write_text
 from mvrecon.core.parts import REGISTRIES, required
 from mvrecon.core.registry import hint
 from mvrecon.operators.ray_transform import RAY_METHODS
@@ -133,9 +131,7 @@ class Stress(Bench):
     def label(self, row: Row) -> str:
         return f"{row['number']:.0f} {row['part']} {row['dtype']}"
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """Yield a verdict for each job."""
         for job in jobs:
             case, subject = job.subject
@@ -143,8 +139,7 @@ class Stress(Bench):
             yield judge(case, subject, self.limit_s)
 
     def summary(self, rows: Sequence[Row], folder: Path) -> str:
-        """Write all rows as JSON; the verdicts on each part, and the failures."""
-        write_text(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
+        """The verdicts on each part, and the failures."""
         groups: dict[tuple[str, ...], list[Row]] = {}
         for row in rows:
             groups.setdefault(tuple(row[name] for name in self.sections), []).append(row)
