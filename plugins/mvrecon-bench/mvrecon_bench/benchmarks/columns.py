@@ -97,11 +97,10 @@ SKIP = table(
     differing="number of values that are not bitwise equal to those of off",
 )
 PRECISION = table(
-    "task precision n device threads status error worst not_finite ms ratio peak_mb calls load",
+    "task precision n device threads status error not_finite ms ratio peak_mb calls load",
     task="the computation",
     precision="storage of volumes and views",
     error="|y - t| / |t|, t in float64 from unrounded operands",
-    worst="greatest absolute error / greatest absolute value of t",
     not_finite="values that are NaN or infinite",
     ratio="ms / that of float32",
 )
