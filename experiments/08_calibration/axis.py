@@ -1,11 +1,12 @@
 """How exactly does `calibrate=[offset_u]` find the axis of rotation of noisy views?
 
-`python experiments/08_calibration/axis.py --out experiments/08_calibration/axis.csv`
+`python experiments/08_calibration/axis.py experiments/08_calibration/axis.csv`
 """
 
-import argparse
 import math
+import sys
 import warnings
+from itertools import product
 
 import torch
 
@@ -16,7 +17,7 @@ from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids
 
-COLUMNS, ROWS, VIEWS, PHOTONS = 192, 24, 120, 2e4
+COLUMNS, ROWS, VIEWS, PHOTONS, CASES = 192, 24, 120, 2e4, 20
 #: Share of the detector's width by which it is aside, and the object's radius relative to that of a
 #: centred detector's field: a half panel sees 6 to 17 columns beyond the axis.
 ASIDE = {"half acquisition": 0.3, "half panel": 0.44}
@@ -74,28 +75,22 @@ def scan(beam, arc, seed):
     return Scan(measured, rig, grid, projector), offset
 
 
-def main():
+def main(out):
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=20)
-    parser.add_argument("--out", default="axis.csv")
-    options = parser.parse_args()
     rows = []
-    for seed in range(options.cases):
-        for beam in ("parallel", "fan", "cone"):
-            for arc in ARCS:
-                case, offset = scan(beam, arc, seed)
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
-                    _, fit = correction.calibrate(case, ["offset_u"], "cpu", Bar())
-                error = fit.misalignment.offset_px[0, 0].item() - offset
-                within = "" if fit.kept else f"{fit.uncertainty['offset_u']:.4f}"
-                row = {"beam": beam, "arc": arc, "seed": seed, "offset, px": f"{offset:.3f}"}
-                row |= {"error, px": f"{error:.4f}", "uncertainty, px": within}
-                rows.append({**row, "kept": " ".join(fit.kept)})
-                print(rows[-1], flush=True)
-                write_rows(options.out, rows)
+    for seed, beam, arc in product(range(CASES), ("parallel", "fan", "cone"), ARCS):
+        case, offset = scan(beam, arc, seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
+            _, fit = correction.calibrate(case, ["offset_u"], "cpu", Bar())
+        error = fit.misalignment.offset_px[0, 0].item() - offset
+        within = "" if fit.kept else f"{fit.uncertainty['offset_u']:.4f}"
+        row = {"beam": beam, "arc": arc, "seed": seed, "offset, px": f"{offset:.3f}"}
+        row |= {"error, px": f"{error:.4f}", "uncertainty, px": within}
+        rows.append({**row, "kept": " ".join(fit.kept)})
+        print(rows[-1], flush=True)
+        write_rows(out, rows)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

@@ -1,9 +1,9 @@
 """Does a calibration leave a correct rig unchanged?
 
-`python experiments/08_calibration/right_rig.py --out experiments/08_calibration/right_rig.csv`
+`python experiments/08_calibration/right_rig.py experiments/08_calibration/right_rig.csv`
 """
 
-import argparse
+import sys
 import warnings
 from functools import partial
 
@@ -55,19 +55,6 @@ def scans():
             }
 
 
-def main():
-    """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", default="right_rig.csv")
-    options = parser.parse_args()
-    rows = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
-        for row in scans():
-            rows.append(row)
-            print(row, flush=True)
-    write_rows(options.out, rows)
-
-
 if __name__ == "__main__":
-    main()
+    warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
+    write_rows(sys.argv[1], list(scans()))

@@ -188,9 +188,8 @@ class Interval(NamedTuple):
     high: float
 
 
-def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
-    """Return the mean of independent normal values and its confidence interval at `level` (Student
-    1908).
+def mean_interval(values: Sequence[float]) -> Interval:
+    """Return the mean of independent normal values and its 95 % confidence interval (Student 1908).
 
     The mean is nan if any value is, and for no value.
     """
@@ -198,7 +197,7 @@ def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
     if len(values) < 2 or not math.isfinite(mean):
         return Interval(mean, math.nan, math.nan)
     error = statistics.stdev(values) / math.sqrt(len(values))
-    half = t_quantile(level, len(values) - 1) * error
+    half = t_quantile(0.95, len(values) - 1) * error
     return Interval(mean, mean - half, mean + half)
 
 
