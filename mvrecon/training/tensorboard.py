@@ -188,14 +188,7 @@ def _writers(trainer: L.Trainer) -> list[Any]:
 
 #: Settings without effect on results, or replaced by `method`.
 IGNORED_SETTINGS = (
-    "name",
-    "resume",
-    "plugins",
-    "callbacks",
-    "logger",
-    "compare",
-    "method",
-    "label",
+    *("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label"),
 )
 #: Figures of the table by their names in the results; costs, and theirs.
 TABLE_FIGURES = ("psnr", "ssim", "view_nrmse")
