@@ -236,8 +236,8 @@ LATEX_SPECIAL = re.compile(r"([&%$#_{}])")
 class Cells(NamedTuple):
     """Headings and rows of texts."""
 
-    head: list[str]
-    body: list[list[str]]
+    head: Sequence[str]
+    body: Sequence[Sequence[str]]
 
 
 def difference(row: Row, reference: Row, metric: str) -> Interval:
@@ -338,9 +338,9 @@ def terminal(table: Cells) -> Table:
     return shown
 
 
-def markdown(table: Cells) -> str:
-    """Format as Markdown."""
-    rule = ["---", "---", *["---:"] * (len(table.head) - 2)]
+def markdown(table: Cells, texts: int = 2) -> str:
+    """Format as Markdown; all columns but the first `texts` are set to the right."""
+    rule = ["---"] * texts + ["---:"] * (len(table.head) - texts)
     lines = [[cell.replace("|", r"\|") for cell in row] for row in (table.head, rule, *table.body)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 

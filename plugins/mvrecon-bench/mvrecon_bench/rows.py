@@ -169,14 +169,6 @@ def measured(rows: Iterable[Row]) -> list[Row]:
     return [row for row in rows if row["status"] == "ok"]
 
 
-def markdown(head: Sequence[str], lines: Iterable[Sequence[str]], texts: int = 1) -> str:
-    """A table; all columns but the first `texts` are right-aligned."""
-    rows = [head, ["---"] * texts + ["---:"] * (len(head) - texts), *lines]
-    return "".join(
-        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |\n" for row in rows
-    )
-
-
 def _parsed(line: Mapping[str, str]) -> Row:
     return {name: value(text) for name, text in line.items() if text}
 

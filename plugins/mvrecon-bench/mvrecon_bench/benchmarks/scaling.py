@@ -11,12 +11,13 @@ import torch
 from mvrecon.core.registry import check_choice
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.report.comparison import Cells, markdown
 from mvrecon_bench.benchmarks import plots
 from mvrecon_bench.benchmarks.cases import DTYPES, FIELD, Workload
 from mvrecon_bench.benchmarks.columns import SCALING
 from mvrecon_bench.benchmarks.trial import Part, Trial, part_label
 from mvrecon_bench.measure import interleaved, load_average, threads
-from mvrecon_bench.rows import Bench, Job, Row, markdown, number, skipped
+from mvrecon_bench.rows import Bench, Job, Row, number, skipped
 
 #: Varied quantity -> setting, and the exponent of the setting in the amount of work.
 AXES = {"voxels": ("n", 3), "rays": ("pixels", 2)}
@@ -132,7 +133,7 @@ class Scaling(Bench):
         )
         plots.scaling(panels, folder / "scaling.png", start)
         head = ("part", "axis", "call", "work", "exponent", "standard error")
-        return f"\nTime = c * work^exponent.\n\n{markdown(head, fits, 4)}"
+        return f"\nTime = c * work^exponent.\n\n{markdown(Cells(head, fits), 4)}"
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[tuple[float, float]]]:

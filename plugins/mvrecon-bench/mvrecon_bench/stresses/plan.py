@@ -9,8 +9,9 @@ from typing import Any
 from mvrecon.core.parts import REGISTRIES, required
 from mvrecon.core.registry import hint
 from mvrecon.operators.ray_transform import RAY_METHODS
+from mvrecon.report.comparison import Cells, markdown
 from mvrecon_bench.benchmarks.cases import DTYPES
-from mvrecon_bench.rows import Bench, Job, Row, figure, markdown
+from mvrecon_bench.rows import Bench, Job, Row, figure
 from mvrecon_bench.stresses.case import KINDS, Case
 from mvrecon_bench.stresses.subject import Subject
 from mvrecon_bench.stresses.subjects import subject_of
@@ -144,10 +145,12 @@ class Stress(Bench):
         for row in rows:
             groups.setdefault(tuple(row[name] for name in self.sections), []).append(row)
         lines = [(*key, *map(str, counts(members).values())) for key, members in groups.items()]
-        text = f"\n{markdown((*self.sections, *counts(rows)), lines, 3)}"
+        text = f"\n{markdown(Cells((*self.sections, *counts(rows)), lines), 3)}"
         failed = [row for row in rows if row["verdict"] == FAIL]
         cells = [[self.label(row), *(figure(row, *one) for one in SHOWN.items())] for row in failed]
-        return text + (f"\n## Failed\n\n{markdown(('', *SHOWN), cells, 8)}" if failed else "")
+        return text + (
+            f"\n## Failed\n\n{markdown(Cells(('', *SHOWN), cells), 7)}" if failed else ""
+        )
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
