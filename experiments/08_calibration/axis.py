@@ -64,9 +64,8 @@ def scan(beam, arc, seed):
     radius = 0.9 * half * WIDER.get(arc.split(", ")[-1], 1)
     rig = rig.shifted(torch.tensor([[ASIDE.get(arc, 0.0) * COLUMNS, 0.0]]))
     offset = 10 * torch.rand(1, generator=rng).item() - 5
-    true = rig.shifted(torch.tensor([[offset, 0.0]])).refined(2)
-    y = phantom(rng, radius, float(ROWS)).integrals(*true.rays()).float()
-    y = torch.nn.functional.avg_pool2d(y[:, None], 2)[:, 0]
+    true = rig.shifted(torch.tensor([[offset, 0.0]]))
+    y = phantom(rng, radius, float(ROWS)).views(true, 2).float()
     y = -(torch.poisson(PHOTONS * (-y).exp(), generator=rng).clamp_min(1) / PHOTONS).log()
     across = math.ceil(2 * radius)
     grid = mv.Grid.centred(size=(across, across, rows), spacing=1.0)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import torch
 from matplotlib import pyplot
-from torch.nn.functional import avg_pool2d
 
 import mvrecon as mv
 from mvrecon.core.files.runs import VERSIONS, read_rows, write_rows
@@ -65,9 +64,7 @@ def cylinder(spheres: torch.Tensor) -> Phantom:
 def counted(phantom: Phantom, A: Spect, seed: int) -> tuple[torch.Tensor, float]:
     """Counts from exact integrals, and by how much they exceed those of an activity of one."""
     pixel = A.pixel_integral()
-    rig = A.cameras.refined(pixel.rays)
-    integrals = phantom.integrals(*rig.rays(), ray_extent=rig.ray_extent)
-    ideal = (avg_pool2d(integrals, pixel.rays) * pixel.weight)[None, None].float()
+    ideal = (phantom.views(A.cameras, pixel.rays) * pixel.weight)[None, None].float()
     scale = COUNTS / ideal.sum().item()
     return torch.poisson(scale * ideal, generator=torch.Generator().manual_seed(seed)), scale
 

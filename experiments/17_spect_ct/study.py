@@ -55,8 +55,7 @@ def transmission() -> torch.Tensor:
     ring = mv.circular(
         n_views=40, sid=300.0, sdd=500.0, detector={"pixels": [72, 72], "pixel_mm": 9.0}
     )
-    phantom = torso(CT_KEV)
-    integrals = phantom.integrals(*ring.rays(), ray_extent=ring.ray_extent).float()
+    integrals = torso(CT_KEV).views(ring).float()
     noise = torch.Generator().manual_seed(0)
     photons = torch.poisson(PHOTONS * torch.exp(-integrals), generator=noise).clamp(min=1)
     views = -torch.log(photons / PHOTONS)[None, None]

@@ -92,7 +92,7 @@ def main(folder: Path) -> None:
     inside = (voxel_centres(GRID) - centre[0])[..., :2].norm(dim=-1) < 30.0
     rows = []
     for name, rig in SCANS.items():
-        views = cylinder.integrals(*rig.rays(), rig.ray_extent)[None, None].float()
+        views = cylinder.views(rig)[None, None].float()
         A = mv.Radon(GRID, rig) if rig.parallel else mv.Drr(GRID, rig)
         row: dict = {"scan": name, "greatest": "", "mean": "", "said": "error"}
         with warnings.catch_warnings(record=True) as caught:

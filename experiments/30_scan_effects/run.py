@@ -72,7 +72,7 @@ def ellipsoids(solids: list) -> Phantom:
 
 
 def views_of(phantom: Phantom, rig: mv.Cameras) -> torch.Tensor:
-    return phantom.integrals(*rig.rays(), rig.ray_extent)[None, None].float()
+    return phantom.views(rig)[None, None].float()
 
 
 def operator(rig: mv.Cameras, grid: mv.Grid) -> mv.Drr | mv.Radon:

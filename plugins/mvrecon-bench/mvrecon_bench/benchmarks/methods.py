@@ -17,7 +17,6 @@ from mvrecon.testing.measures import gap
 from mvrecon_bench.benchmarks.cases import Workload, case_label, expand
 from mvrecon_bench.benchmarks.columns import METHODS
 from mvrecon_bench.benchmarks.trial import Part, part_label
-from mvrecon_bench.benchmarks.truth import pixel_mean
 from mvrecon_bench.measure import interleaved, load_average, once, threads, with_memory
 from mvrecon_bench.rows import Bench, Job, Row, skipped
 
@@ -38,7 +37,7 @@ class MethodInputs(NamedTuple):
 def measurement_of(case: Workload, rays: int) -> MethodInputs:
     """Views as means of rays x rays exact integrals per pixel, and the truth of a case."""
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
-    views = pixel_mean(phantom, rig, rays)[None, None].float()
+    views = phantom.views(rig, rays)[None, None].float()
     volume = voxelise(phantom, grid).float()
     return MethodInputs(RayTransform(grid, rig), views, volume, volume > 0)
 

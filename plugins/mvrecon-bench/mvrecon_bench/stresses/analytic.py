@@ -85,8 +85,7 @@ def box_lengths(rig: Cameras, grid: Grid, grown: float = 0.0) -> Float[Tensor, "
     """
     sizes = zip(grid.shape[::-1], grid.spacing, strict=True)
     half = torch.tensor([[(n / 2 + grown) * mm for n, mm in sizes]], dtype=torch.float64)
-    box = Phantom((Solids.upright("box", grid.centre[None], half, torch.ones(1)),))
-    return box.integrals(*rig.rays(), ray_extent=rig.ray_extent)
+    return Phantom((Solids.upright("box", grid.centre[None], half, torch.ones(1)),)).views(rig)
 
 
 @dataclass(frozen=True, eq=False)
