@@ -27,7 +27,7 @@ from mvrecon_spect.metrics.repeated import repeated
 from mvrecon_spect.operators.projector import Spect
 
 GRID = mv.Grid.centred(64, spacing=2.5)
-RATIO, COUNTS = 5.0, 5e6
+RATIO, COUNTS, DRAWS = 5.0, 5e6, 20
 DIAMETERS = torch.tensor([10.0, 13.0, 17.0, 22.0])
 WELLS = (10, 8, 7, 6, 5, 4)
 #: Iterations, and the method up to a number of them.
@@ -112,7 +112,7 @@ def resolved(A: Spect) -> list[dict]:
     return rows
 
 
-def spreads(A: Spect, draws: int = 20) -> list[dict]:
+def spreads(A: Spect) -> list[dict]:
     """Bias and standard deviation over noise draws, in the spheres and in the background."""
     phantom = cylinder(ring(45.0, 4))
     truth = voxelise(phantom, GRID)
@@ -125,10 +125,10 @@ def spreads(A: Spect, draws: int = 20) -> list[dict]:
             y, scale = counted(phantom, A, 100 + seed)
             return method(A, y, 5)[0, 0] / scale
 
-        figures = repeated(map(volume, range(draws)), truth)
+        figures = repeated(map(volume, range(DRAWS)), truth)
         for region, mask in regions.items():
             values = figures.within(mask)._asdict()
-            row = {"method": name, "iterations": 5, "region": region, "draws": draws}
+            row = {"method": name, "iterations": 5, "region": region, "draws": DRAWS}
             rows.append(row | {k: f"{v:.4f}" for k, v in values.items()})
     return rows
 

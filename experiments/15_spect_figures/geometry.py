@@ -28,11 +28,10 @@ def geometry(out: Path) -> None:
     save_picture(out / "rig.png", mv.dcspect80(pixels=32), mv.Grid.centred(64, spacing=2.0))
 
 
-def ball(radius: float, centre=(0.0, 0.0, 0.0), value: float = 1.0) -> Phantom:
+def ball(radius: float, centre=(0.0, 0.0, 0.0)) -> Phantom:
     """A uniform ball; mm."""
     place = torch.as_tensor(centre, dtype=torch.float64)[None]
-    size, values = torch.full((1, 3), radius), torch.tensor([value])
-    return Phantom((Solids.upright("ellipsoid", place, size, values),))
+    return Phantom((Solids.upright("ellipsoid", place, torch.full((1, 3), radius), torch.ones(1)),))
 
 
 def counts_of(phantom: Phantom, cameras: mv.Cameras, diameter: float) -> torch.Tensor:
