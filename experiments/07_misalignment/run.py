@@ -5,15 +5,15 @@ ones in the back-projection alone (Karolczak and others, Med. Phys. 28, 2001), a
 """
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import torch
+from matplotlib import pyplot
 
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
-from mvrecon.geometry.rigid import euler_rotation
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 
 GRID = mv.Grid.centred(size=(96, 96, 96), spacing=1.5)
 RIG = mv.circular(240, 500.0, 800.0, {"pixels": [128, 128], "pixel_mm": 2.0})
@@ -24,45 +24,27 @@ def disks() -> Phantom:
     centres = torch.zeros(5, 3)
     centres[:, 2] = 20.0 * torch.arange(-2, 3) + 0.6
     sizes, values = torch.tensor([[50.0, 50.0, 5.0]]).expand(5, 3), torch.full((5,), 0.02)
-    return Phantom((Solids("ellipsoid", centres, torch.eye(3).expand(5, 3, 3), sizes, values),))
-
-
-def misaligned(
-    rig: mv.Cameras,
-    pixels: torch.Tensor,
-    degrees: torch.Tensor,
-    source_mm: torch.Tensor,
-) -> mv.Cameras:
-    """Detectors shifted by pixels (u, v), turned about their own axes (u, v, normal) by degrees,
-    and sources shifted by mm along these: one row per view, or one for all.
-    """
-    count, (rows, columns) = len(rig), rig.shape
-    u, v = (torch.nn.functional.normalize(step, dim=-1) for step in (rig.u, rig.v))
-    axes = torch.stack([u, v, torch.linalg.cross(u, v)], dim=-1)
-    turns = axes @ euler_rotation(degrees.expand(count, 3), "xyz") @ axes.mT
-    centre = rig.origin + rig.u * (columns - 1) / 2 + rig.v * (rows - 1) / 2
-    shift = pixels.expand(count, 2)
-    centre = centre + rig.u * shift[:, :1] + rig.v * shift[:, 1:]
-    new_u, new_v = ((turns @ step[..., None])[..., 0] for step in (rig.u, rig.v))
-    source = rig.source + (axes @ source_mm.expand(count, 3)[..., None])[..., 0]
-    origin = centre - new_u * (columns - 1) / 2 - new_v * (rows - 1) / 2
-    return replace(rig, source=source, origin=origin, u=new_u, v=new_v)
+    return Phantom((Solids.upright("ellipsoid", centres, sizes, values),))
 
 
 def cases() -> dict[str, mv.Cameras]:
     """Errors that are the same in all views, and errors of each view's own."""
     torch.manual_seed(0)
-    draw = {"dtype": torch.float64}
-    same = [torch.tensor(x, **draw) for x in ([2.0, -2.0], [1.0, -1.0, 1.0], [2.0, -2.0, 3.0])]
-    own = [s * torch.randn(len(RIG), n, **draw) for s, n in ((1.0, 2), (0.5, 3), (1.0, 3))]
-    return {
-        "none": RIG,
-        "offset of 2 pixels": misaligned(RIG, same[0], 0 * same[1], 0 * same[2]),
-        "tilts of 1 degree": misaligned(RIG, 0 * same[0], same[1], 0 * same[2]),
-        "source 2 to 3 mm": misaligned(RIG, 0 * same[0], 0 * same[1], same[2]),
-        "all three": misaligned(RIG, *same),
-        "own in each view": misaligned(RIG, *own),
+    none = Misalignment.none(len(RIG))
+    offset = none.offset_px + torch.tensor([2.0, -2.0])
+    tilt = none.tilt_degrees + torch.tensor([1.0, -1.0, 1.0])
+    source = none.source_mm + torch.tensor([2.0, -2.0, 3.0])
+    sizes = ((1.0, 2), (0.5, 3), (1.0, 3))
+    own = [s * torch.randn(len(RIG), n, dtype=torch.float64) for s, n in sizes]
+    errors = {
+        "none": none,
+        "offset of 2 pixels": none._replace(offset_px=offset),
+        "tilts of 1 degree": none._replace(tilt_degrees=tilt),
+        "source 2 to 3 mm": none._replace(source_mm=source),
+        "all three": Misalignment(offset, tilt, source, none.depth_mm),
+        "own in each view": Misalignment(*own, none.depth_mm),
     }
+    return {name: misaligned(RIG, by) for name, by in errors.items()}
 
 
 def main(folder: Path) -> None:
@@ -70,9 +52,7 @@ def main(folder: Path) -> None:
     truth = voxelise(phantom, GRID, 3)
     ideal, best = mv.Drr(GRID, RIG), None
     for name, rig in cases().items():
-        start, end = rig.refined(2).rays()  # a pixel is the mean over four rays
-        views = phantom.integrals(start, end, rig.ray_extent)[None].float()
-        views = torch.nn.functional.avg_pool2d(views, 2)[None]
+        views = phantom.views(rig, 2)[None, None].float()
         volumes = {
             "ideal": mv.fdk(ideal, views),
             "back-projection": mv.fdk(mv.Drr(GRID, rig), views, weights_from=RIG),
@@ -99,11 +79,6 @@ def main(folder: Path) -> None:
 
 def draw(planes: dict[str, list[torch.Tensor]], file: Path) -> None:
     """Coronal planes, a row for each misalignment."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     titles = ("aligned scanner", "ideal matrices", "true in\nback-projection", "true everywhere")
     shape = {"figsize": (8, 4.4), "sharex": True, "sharey": True}
     figure, axes = pyplot.subplots(len(planes), 4, layout="constrained", **shape)

@@ -1,11 +1,12 @@
 """How exactly does `calibrate=[offset_u]` find the axis of rotation of noisy views?
 
-`python experiments/08_calibration/axis.py --out experiments/08_calibration/axis.csv`
+`python experiments/08_calibration/axis.py experiments/08_calibration/axis.csv`
 """
 
-import argparse
 import math
+import sys
 import warnings
+from itertools import product
 
 import torch
 
@@ -16,7 +17,7 @@ from mvrecon.apps.scan import Scan, ViewsInMemory
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids
 
-COLUMNS, ROWS, VIEWS, PHOTONS = 192, 24, 120, 2e4
+COLUMNS, ROWS, VIEWS, PHOTONS, CASES = 192, 24, 120, 2e4, 20
 #: Share of the detector's width by which it is aside, and the object's radius relative to that of a
 #: centred detector's field: a half panel sees 6 to 17 columns beyond the axis.
 ASIDE = {"half acquisition": 0.3, "half panel": 0.44}
@@ -40,14 +41,9 @@ def phantom(rng, radius, height):
     body = torch.cat([draw(0.6, 0.9, 2) * radius, torch.tensor([10 * height])])
     angle, far = draw(0, 2 * math.pi, 8), draw(0, 0.5, 8) * radius
     centres = torch.stack([far * angle.cos(), far * angle.sin(), draw(-0.3, 0.3, 8) * height], 1)
-    radii, turn = draw(0.04, 0.2, 8, 3) * radius, torch.eye(3, dtype=torch.float64)
-    first = turn[None], torch.zeros(1, 3).double()
-    return Phantom(
-        (
-            Solids("cylinder", first[1], first[0], body[None], torch.tensor([1.2 / radius])),
-            Solids("ellipsoid", centres, turn.expand(8, 3, 3), radii, draw(-0.8, 2, 8) / radius),
-        )
-    )
+    radii, values = draw(0.04, 0.2, 8, 3) * radius, draw(-0.8, 2, 8) / radius
+    outer = Solids.upright("cylinder", torch.zeros(1, 3), body[None], torch.tensor([1.2 / radius]))
+    return Phantom((outer, Solids.upright("ellipsoid", centres, radii, values)))
 
 
 def scan(beam, arc, seed):
@@ -68,9 +64,8 @@ def scan(beam, arc, seed):
     radius = 0.9 * half * WIDER.get(arc.split(", ")[-1], 1)
     rig = rig.shifted(torch.tensor([[ASIDE.get(arc, 0.0) * COLUMNS, 0.0]]))
     offset = 10 * torch.rand(1, generator=rng).item() - 5
-    true = rig.shifted(torch.tensor([[offset, 0.0]])).refined(2)
-    y = phantom(rng, radius, float(ROWS)).integrals(*true.rays()).float()
-    y = torch.nn.functional.avg_pool2d(y[:, None], 2)[:, 0]
+    true = rig.shifted(torch.tensor([[offset, 0.0]]))
+    y = phantom(rng, radius, float(ROWS)).views(true, 2).float()
     y = -(torch.poisson(PHOTONS * (-y).exp(), generator=rng).clamp_min(1) / PHOTONS).log()
     across = math.ceil(2 * radius)
     grid = mv.Grid.centred(size=(across, across, rows), spacing=1.0)
@@ -79,28 +74,22 @@ def scan(beam, arc, seed):
     return Scan(measured, rig, grid, projector), offset
 
 
-def main():
+def main(out):
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cases", type=int, default=20)
-    parser.add_argument("--out", default="axis.csv")
-    options = parser.parse_args()
     rows = []
-    for seed in range(options.cases):
-        for beam in ("parallel", "fan", "cone"):
-            for arc in ARCS:
-                case, offset = scan(beam, arc, seed)
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
-                    _, fit = correction.calibrate(case, ["offset_u"], "cpu", Bar())
-                error = fit.misalignment.offset_px[0, 0].item() - offset
-                within = "" if fit.kept else f"{fit.uncertainty['offset_u']:.4f}"
-                row = {"beam": beam, "arc": arc, "seed": seed, "offset, px": f"{offset:.3f}"}
-                row |= {"error, px": f"{error:.4f}", "uncertainty, px": within}
-                rows.append({**row, "kept": " ".join(fit.kept)})
-                print(rows[-1], flush=True)
-                write_rows(options.out, rows)
+    for seed, beam, arc in product(range(CASES), ("parallel", "fan", "cone"), ARCS):
+        case, offset = scan(beam, arc, seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
+            _, fit = correction.calibrate(case, ["offset_u"], "cpu", Bar())
+        error = fit.misalignment.offset_px[0, 0].item() - offset
+        within = "" if fit.kept else f"{fit.uncertainty['offset_u']:.4f}"
+        row = {"beam": beam, "arc": arc, "seed": seed, "offset, px": f"{offset:.3f}"}
+        row |= {"error, px": f"{error:.4f}", "uncertainty, px": within}
+        rows.append({**row, "kept": " ".join(fit.kept)})
+        print(rows[-1], flush=True)
+        write_rows(out, rows)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

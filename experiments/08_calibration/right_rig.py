@@ -1,9 +1,9 @@
 """Does a calibration leave a correct rig unchanged?
 
-`python experiments/08_calibration/right_rig.py --out experiments/08_calibration/right_rig.csv`
+`python experiments/08_calibration/right_rig.py experiments/08_calibration/right_rig.csv`
 """
 
-import argparse
+import sys
 import warnings
 from functools import partial
 
@@ -11,7 +11,7 @@ import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.core.parts import SCENES
 
-EDGE = 96.0  # mm of the grid
+EDGE, SIZE, VIEWS = 96.0, 32, 60  # mm and voxels of the grid
 OBJECTS = ("shepp_logan", "ellipsoids", "derenzo")
 FREE = (
     ("slant",),
@@ -23,13 +23,13 @@ FREE = (
 )
 
 
-def scans(size, views):
+def scans():
     """Rows of the table: exact views of a correct rig, reconstructed with it and with the fitted
     one.
     """
-    grid = mv.Grid.centred(size, spacing=EDGE / size)
-    pixels = [size * 5 // 4, size * 4 // 3]
-    rig = mv.circular(views, 400.0, 600.0, {"pixels": pixels, "pixel_mm": 1.6 * EDGE / size})
+    grid = mv.Grid.centred(SIZE, spacing=EDGE / SIZE)
+    panel = {"pixels": [SIZE * 5 // 4, SIZE * 4 // 3], "pixel_mm": 1.6 * EDGE / SIZE}
+    rig = mv.circular(VIEWS, 400.0, 600.0, panel)
     for name in OBJECTS:
         scene = SCENES.build(name).sample(0, 0, grid, rig)
         y, truth = scene.views[None], scene.volume[None]
@@ -55,21 +55,6 @@ def scans(size, views):
             }
 
 
-def main():
-    """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=32)
-    parser.add_argument("--views", type=int, default=60)
-    parser.add_argument("--out", default="right_rig.csv")
-    options = parser.parse_args()
-    rows = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
-        for row in scans(options.size, options.views):
-            rows.append(row)
-            print(row, flush=True)
-    write_rows(options.out, rows)
-
-
 if __name__ == "__main__":
-    main()
+    warnings.simplefilter("ignore", UserWarning)  # what is kept is a column
+    write_rows(sys.argv[1], list(scans()))

@@ -1,10 +1,9 @@
 """How exactly is a misaligned rig recovered, from markers and from the views alone?
 
-`python experiments/08_calibration/study.py --size 32 --views 24 --out
-experiments/08_calibration/results.csv`
+`python experiments/08_calibration/study.py experiments/08_calibration/results.csv`
 """
 
-import argparse
+import sys
 from functools import partial
 
 import torch
@@ -18,7 +17,7 @@ from mvrecon.geometry.grid import voxel_centres
 from mvrecon.methods.calibration.from_data import without_motion
 from mvrecon.methods.calibration.markers import centroids, helix
 
-EDGE = 96.0  # mm of the grid
+EDGE, SIZE, VIEWS = 96.0, 32, 24  # mm and voxels of the grid
 NOISE = [(None, 0), (1e4, 0), (1e4, 1), (1e4, 2)]  # photons and seed
 
 
@@ -33,10 +32,7 @@ def blobs(grid, rig):
 
 def head(grid, rig):
     """Closed-form integrals of the Shepp-Logan phantom: sharp, with no grid behind them."""
-    phantom = shepp_logan(0.4 * EDGE, value=0.03)
-    fine = rig.refined(4)
-    y = phantom.integrals(*fine.rays()).float()
-    return torch.nn.functional.avg_pool2d(y, 4)[None, None]
+    return shepp_logan(0.4 * EDGE, value=0.03).views(rig, 4)[None, None].float()
 
 
 def counted(y, photons, seed):
@@ -48,16 +44,16 @@ def counted(y, photons, seed):
     return -torch.log(torch.poisson(photons * torch.exp(-y), generator=rng).clamp_min(1) / photons)
 
 
-def from_views(size, views):
+def from_views():
     """Rows of the table: what all views share, and shifts and gains of single views."""
-    grid = mv.Grid.centred(size, spacing=EDGE / size)
-    pitch = 1.6 * EDGE / size
-    rig = mv.circular(views, 400.0, 600.0, {"pixels": [size, size * 4 // 3], "pixel_mm": pitch})
-    shared = Misalignment.none(views)
+    grid = mv.Grid.centred(SIZE, spacing=EDGE / SIZE)
+    panel = {"pixels": [SIZE, SIZE * 4 // 3], "pixel_mm": 1.6 * EDGE / SIZE}
+    rig = mv.circular(VIEWS, 400.0, 600.0, panel)
+    shared = Misalignment.none(VIEWS)
     shared.offset_px[:, 0], shared.tilt_degrees[:, 2] = 1.3, 0.7
     rng = torch.Generator().manual_seed(3)
-    noise = torch.randn(views, 3, generator=rng, dtype=torch.float64)
-    single = Misalignment.none(views)._replace(offset_px=without_motion(rig, 0.7 * noise[:, :2]))
+    noise = torch.randn(VIEWS, 3, generator=rng, dtype=torch.float64)
+    single = Misalignment.none(VIEWS)._replace(offset_px=without_motion(rig, 0.7 * noise[:, :2]))
     gains = (0.03 * (noise[:, 2] - noise[:, 2].mean())).exp()
     every = torch.ones_like(gains)
     for scene in (blobs, head):
@@ -93,12 +89,9 @@ def from_balls(views):
     ideal = mv.circular(views, 400.0, 600.0, plate)
     rig = perturbed(ideal, offset_px=2.0, tilt_degrees=1.0, source_mm=1.0, seed=1)
     markers = helix(20, 30.0, 60.0, 1.7)
-    turn = torch.eye(3, dtype=torch.float64).expand(len(markers), 3, 3)
-    radii = torch.full((len(markers), 3), 1.5, dtype=torch.float64)
-    values = torch.full((len(markers),), 0.3, dtype=torch.float64)
-    phantom = Phantom((Solids("ellipsoid", markers, turn, radii, values),))
-    integrals = phantom.integrals(*rig.refined(3).rays()).float()
-    exact = torch.nn.functional.avg_pool2d(integrals, 3)[None, None]
+    radii, values = torch.full_like(markers, 1.5), torch.full_like(markers[:, 0], 0.3)
+    phantom = Phantom((Solids.upright("ellipsoid", markers, radii, values),))
+    exact = phantom.views(rig, 3)[None, None].float()
     for photons, seed in NOISE:
         y = counted(exact, photons, seed)[0, 0]
         uv = centroids(y, ideal.project(markers)[..., :2], radius_px=9.0)
@@ -109,19 +102,6 @@ def from_balls(views):
         yield {**name, "from": "rays through markers (rms)", "error": rms, "unit": "px"}
 
 
-def main():
-    """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", type=int, default=32)
-    parser.add_argument("--views", type=int, default=24)
-    parser.add_argument("--out", default="results.csv")
-    options = parser.parse_args()
-    rows = []
-    for row in (*from_balls(8), *from_views(options.size, options.views)):
-        rows.append({**row, "error": f"{float(row['error']):.2g}"})
-        print(rows[-1], flush=True)
-    write_rows(options.out, rows)
-
-
 if __name__ == "__main__":
-    main()
+    rows = (*from_balls(8), *from_views())
+    write_rows(sys.argv[1], [row | {"error": f"{float(row['error']):.2g}"} for row in rows])

@@ -6,7 +6,6 @@ SCAN is a run folder of `mvrecon-simulate rtk=true`, VOLUMES holds what `mvrecon
 of it (in HU). Needs itk-rtk. RTK reads TIFF and XML by its own readers; mvrecon reads NIfTI alone.
 """
 
-import csv
 import sys
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from PIL import Image
 from torch import Tensor
 
 import mvrecon as mv
+from mvrecon.core.files.runs import write_rows
 from mvrecon.data.attenuation import attenuation
 from mvrecon.report.metrics import volume_metrics
 from mvrecon.report.viz import review
@@ -65,15 +65,19 @@ def rtk_fdk(scan: Path, projections: Path, grid: mv.Grid) -> Float[Tensor, "d h 
     return volume.transpose(0, 1).flip(-1)
 
 
-def row(name: str, volume: Tensor, other: Tensor, body: Tensor) -> list[str]:
+def row(name: str, volume: Tensor, other: Tensor, body: Tensor) -> dict[str, str]:
     """Differences of two volumes in 1/mm: relative L2, in the body, and the slope of one on the
     other there.
     """
     apart = volume - other
     inside, base = volume[body].double(), other[body].double()
-    slope = ((inside * base).sum() / base.square().sum()).item()
-    errors = (apart.norm() / other.norm(), apart[body].norm() / other[body].norm())
-    return [name, *(f"{error.item():.4f}" for error in errors), f"{slope:.4f}"]
+    slope = (inside * base).sum() / base.square().sum()
+    figures = {
+        "relative L2": apart.norm() / other.norm(),
+        "relative L2 in the body": apart[body].norm() / other[body].norm(),
+        "slope": slope,
+    }
+    return {"difference": name} | {key: f"{value:.4f}" for key, value in figures.items()}
 
 
 def coronal(volumes: dict[str, Tensor], truth: Tensor, grid: mv.Grid):
@@ -107,10 +111,7 @@ def main(scan: Path, volumes: Path, folder: Path) -> None:
     ]
     for name in ("fdk_floor", "fdk"):
         rows.insert(0, row(f"{name} - rtk_fdk", shown[name], peer, body))
-    with (folder / "results.csv").open("w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(["difference", "relative L2", "relative L2 in the body", "slope"])
-        table.writerows(rows)
+    write_rows(folder / "results.csv", rows)
     shown.pop("fdk_floor", None)
     named = {"FDK": shown.pop("fdk"), "RTK's FDK": peer}
     named |= {name.upper().replace("_", "-"): x for name, x in shown.items()}

@@ -6,17 +6,16 @@ python experiments/14_counts/recovery.py OUT_FOLDER
 A folder with the first table gets the picture of it alone.
 """
 
-import csv
 import math
 import sys
 import time
 from pathlib import Path
 
 import torch
-from torch.nn.functional import avg_pool2d
+from matplotlib import pyplot
 
 import mvrecon as mv
-from mvrecon.core.files.runs import VERSIONS, write_rows
+from mvrecon.core.files.runs import VERSIONS, read_rows, write_rows
 from mvrecon.data.scenes.phantoms import derenzo
 from mvrecon.data.scenes.solids import Phantom, Solids, voxelise
 from mvrecon.training.run_folder import versions
@@ -28,7 +27,7 @@ from mvrecon_spect.metrics.repeated import repeated
 from mvrecon_spect.operators.projector import Spect
 
 GRID = mv.Grid.centred(64, spacing=2.5)
-RATIO, COUNTS = 5.0, 5e6
+RATIO, COUNTS, DRAWS = 5.0, 5e6, 20
 DIAMETERS = torch.tensor([10.0, 13.0, 17.0, 22.0])
 WELLS = (10, 8, 7, 6, 5, 4)
 #: Iterations, and the method up to a number of them.
@@ -57,18 +56,15 @@ def ring(radius: float, count: int, z: float = 0.0, start: float = 0.0) -> torch
 
 def cylinder(spheres: torch.Tensor) -> Phantom:
     """Hot spheres in a warm cylinder of radius 72 mm and height 80 mm."""
-    turns, radii = torch.eye(3).expand(4, 3, 3), (DIAMETERS / 2)[:, None].expand(4, 3)
-    size = torch.tensor([[72.0, 72.0, 40.0]])
-    body = Solids("cylinder", torch.zeros(1, 3), turns[:1], size, torch.ones(1))
-    return Phantom((body, Solids("ellipsoid", spheres, turns, radii, torch.full((4,), RATIO - 1))))
+    radii, size = (DIAMETERS / 2)[:, None].expand(4, 3), torch.tensor([[72.0, 72.0, 40.0]])
+    body = Solids.upright("cylinder", torch.zeros(1, 3), size, torch.ones(1))
+    return Phantom((body, Solids.upright("ellipsoid", spheres, radii, torch.full((4,), RATIO - 1))))
 
 
 def counted(phantom: Phantom, A: Spect, seed: int) -> tuple[torch.Tensor, float]:
     """Counts from exact integrals, and by how much they exceed those of an activity of one."""
     pixel = A.pixel_integral()
-    rig = A.cameras.refined(pixel.rays)
-    integrals = phantom.integrals(*rig.rays(), ray_extent=rig.ray_extent)
-    ideal = (avg_pool2d(integrals, pixel.rays) * pixel.weight)[None, None].float()
+    ideal = (phantom.views(A.cameras, pixel.rays) * pixel.weight)[None, None].float()
     scale = COUNTS / ideal.sum().item()
     return torch.poisson(scale * ideal, generator=torch.Generator().manual_seed(seed)), scale
 
@@ -116,7 +112,7 @@ def resolved(A: Spect) -> list[dict]:
     return rows
 
 
-def spreads(A: Spect, draws: int = 20) -> list[dict]:
+def spreads(A: Spect) -> list[dict]:
     """Bias and standard deviation over noise draws, in the spheres and in the background."""
     phantom = cylinder(ring(45.0, 4))
     truth = voxelise(phantom, GRID)
@@ -129,27 +125,22 @@ def spreads(A: Spect, draws: int = 20) -> list[dict]:
             y, scale = counted(phantom, A, 100 + seed)
             return method(A, y, 5)[0, 0] / scale
 
-        figures = repeated(map(volume, range(draws)), truth)
+        figures = repeated(map(volume, range(DRAWS)), truth)
         for region, mask in regions.items():
             values = figures.within(mask)._asdict()
-            row = {"method": name, "iterations": 5, "region": region, "draws": draws}
+            row = {"method": name, "iterations": 5, "region": region, "draws": DRAWS}
             rows.append(row | {k: f"{v:.4f}" for k, v in values.items()})
     return rows
 
 
 def draw(rows: list[dict], file: Path) -> None:
     """Recovery over variability of two spheres, and over the processor's time."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     figure = pyplot.figure(figsize=(8, 6.4), layout="constrained")
     axes = list(figure.subplot_mosaic("AB;CC").values())
     for name in METHODS:
         lines = [r for r in rows if r["method"] == name]
         for axis, diameter in zip(axes, (13.0, 22.0), strict=False):
-            points = [r for r in lines if r["sphere_mm"] == diameter]
+            points = [r for r in lines if float(r["sphere_mm"]) == diameter]
             pairs = [(float(r["variability"]), float(r["recovery"])) for r in points]
             axis.plot(*zip(*pairs, strict=True), ".-", label=TOLD[name])
             axis.set(xlabel="background variability", ylabel="contrast recovery")
@@ -179,8 +170,6 @@ def main(out: Path) -> None:
 
 if __name__ == "__main__":
     if (table := Path(sys.argv[1]) / "recovery.csv").exists():  # the picture of the table
-        with table.open() as file:
-            kept: list[dict] = list(csv.DictReader(file))
-        draw([r | {"sphere_mm": float(r["sphere_mm"])} for r in kept], table.with_suffix(".png"))
+        draw(read_rows(table), table.with_suffix(".png"))
     else:
         main(Path(sys.argv[1]))

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 from geometry import HOLE, ball, counts_of, geometry
+from matplotlib import pyplot
 
 import mvrecon as mv
 from mvrecon.core.files.runs import read_rows, write_rows
@@ -113,11 +114,6 @@ def wells(out: Path) -> None:
 
 def draw_views(views: torch.Tensor, file: Path) -> None:
     """The 80 views, a row for each row of 20 modules."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     n = views.shape[-1]
     mosaic = views.reshape(4, 20, n, n).permute(0, 2, 1, 3).reshape(4 * n, 20 * n)
     figure, axis = pyplot.subplots(figsize=(8, 2), layout="constrained")
@@ -146,11 +142,6 @@ def sectors(x: torch.Tensor, blur: str, iteration: int) -> list[dict]:
 
 def draw(out: Path) -> None:
     """Error over voxel size, MTF, bias of counts, from the tables."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     figure = pyplot.figure(figsize=(8, 6.8), layout="constrained")
     axes = figure.subplot_mosaic([["convergence", "bias"], ["mtf", "mtf"]])
     panels = (

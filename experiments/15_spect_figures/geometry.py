@@ -28,17 +28,15 @@ def geometry(out: Path) -> None:
     save_picture(out / "rig.png", mv.dcspect80(pixels=32), mv.Grid.centred(64, spacing=2.0))
 
 
-def ball(radius: float, centre=(0.0, 0.0, 0.0), value: float = 1.0) -> Phantom:
+def ball(radius: float, centre=(0.0, 0.0, 0.0)) -> Phantom:
     """A uniform ball; mm."""
     place = torch.as_tensor(centre, dtype=torch.float64)[None]
-    size, values = torch.full((1, 3), radius), torch.tensor([value])
-    return Phantom((Solids("ellipsoid", place, torch.eye(3)[None], size, values),))
+    return Phantom((Solids.upright("ellipsoid", place, torch.full((1, 3), radius), torch.ones(1)),))
 
 
 def counts_of(phantom: Phantom, cameras: mv.Cameras, diameter: float) -> torch.Tensor:
     """Expected counts [m v u] from exact integrals."""
-    integrals = phantom.integrals(*cameras.rays(), ray_extent=cameras.ray_extent)
-    return integrals * Hole(diameter).weight(cameras)
+    return phantom.views(cameras) * Hole(diameter).weight(cameras)
 
 
 def inverse_square() -> dict:
@@ -120,8 +118,7 @@ def attenuation() -> tuple[dict, list[dict]]:
     """The attenuated central pixel of a filled ball, R = 100 mm, and the error over voxel sizes."""
     camera, parts = mv.dcspect80(pixels=33, field=2)[[0]], 8
     fine, phantom = camera.refined(parts), ball(100.0)
-    chord = phantom.integrals(*fine.rays(), ray_extent=fine.ray_extent)
-    counts = -torch.expm1(-MU * chord) / MU * Hole(HOLE).weight(fine)
+    counts = -torch.expm1(-MU * phantom.views(fine)) / MU * Hole(HOLE).weight(fine)
     exact = parts**2 * torch.nn.functional.avg_pool2d(counts, parts)
     weight, rows = Hole(HOLE).weight(camera)[0, 16, 16], []
     for n in (16, 32, 64, 128):

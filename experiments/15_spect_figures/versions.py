@@ -14,7 +14,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-PLUGINS = ("mvrecon-spect",)
 #: Voxels and pixels along an edge, model; greatest ratio of an iteration asked for.
 CASES = [
     (64, 64, "plain", 1.5), (64, 64, "mu", None), (64, 64, "blur", 1.2), (64, 64, "blur mu", 1.0),

@@ -1,11 +1,10 @@
 """The shipped network `any_rig` on unseen rigs, on faulty views and on other objects than patients,
 compared with SIRT and FISTA-TV, whose best number of iterations and weight are chosen with the
 ground truth of each case:
-python experiments/16_any_rig/domains.py data --out experiments/16_any_rig/domains.csv
+python experiments/16_any_rig/domains.py data experiments/16_any_rig/domains.csv
 """
 
-import argparse
-from pathlib import Path
+import sys
 
 import torch
 from torch import Tensor
@@ -15,6 +14,7 @@ from mvrecon.core.files.runs import write_rows
 from mvrecon.core.parts import SCENES
 from mvrecon.data.acquisition.acquired import Acquired
 from mvrecon.data.acquisition.detector import Acquisition
+from mvrecon.report.metrics import psnr
 
 #: Seeds of rigs, which the training of `experiment=any_rig` (1 to 48) does not contain.
 RIGS = range(100, 106)
@@ -28,22 +28,16 @@ CASES = 2
 FAULTS = {"views": 3, "shift_px": 1.0, "gain": 0.05, "tilt_deg": 3.0, "motion_mm": 10.0}
 
 
-def psnr(volume: Tensor, truth: Tensor) -> float:
-    """In dB, relative to the greatest value of the truth."""
-    error = (volume - truth).square().mean().sqrt()
-    return 20 * (truth.max() / error).log10().item()
-
-
 @torch.no_grad()
-def main() -> None:
-    """Reconstruct cases of each scene with each rig by all methods."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", help="folder with the files of scripts/data/prepare_openkbp.py")
-    parser.add_argument("--network", default="any_rig", help="weights, as mvrecon.load takes them")
-    parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
-    given = parser.parse_args()
-    trained, grid, rows = mv.load(given.network), mv.Grid.centred(**GRID), []
-    patients = SCENES.build("hdf5", path=f"{given.folder}/openkbp_val.h5", orientation="LPI")
+def main(folder: str, out: str) -> None:
+    """Reconstruct cases of each scene with each rig by all methods.
+
+    Args:
+        folder: with the files of scripts/data/prepare_openkbp.py.
+        out: CSV file to write.
+    """
+    trained, grid, rows = mv.load("any_rig"), mv.Grid.centred(**GRID), []
+    patients = SCENES.build("hdf5", path=f"{folder}/openkbp_val.h5", orientation="LPI")
     faulty = Acquisition.of({"disturbed": FAULTS})
     scenes = {
         "patients": patients,
@@ -59,21 +53,21 @@ def main() -> None:
                 sample = scene.sample(case, seed, grid, cameras)
                 views, truth = sample.views[None], sample.volume[None]
                 level = truth.max().item()
+
+                def error(volume: Tensor, truth=truth, level=level) -> float:
+                    return psnr(volume, truth, truth > 0, level)
+
+                sirt = {n: error(mv.sirt(A, views, n, momentum=True)) for n in ITERATIONS}
                 row = {"scene": name, "rig": seed, "views": len(cameras), "case": case}
-                row["any_rig"] = psnr(trained(views, cameras, grid), truth)
-                alone = trained(views, cameras, grid, fallback=False)
-                row["without_fallback"] = psnr(alone, truth)
-                row["sirt"] = max(
-                    psnr(mv.sirt(A, views, n, momentum=True), truth) for n in ITERATIONS
-                )
-                row["sirt_12"] = psnr(mv.sirt(A, views, 12, momentum=True), truth)
+                row["any_rig"] = error(trained(views, cameras, grid))
+                row["without_fallback"] = error(trained(views, cameras, grid, fallback=False))
+                row |= {"sirt": max(sirt.values()), "sirt_12": sirt[12]}
                 row["fista_tv"] = max(
-                    psnr(mv.fista_tv(A, views, weight=w * level, iterations=60), truth)
-                    for w in WEIGHTS
+                    error(mv.fista_tv(A, views, weight=w * level, iterations=60)) for w in WEIGHTS
                 )
                 rows.append({k: round(v, 3) if isinstance(v, float) else v for k, v in row.items()})
-    write_rows(given.out, rows)
+    write_rows(out, rows)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

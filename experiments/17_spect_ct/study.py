@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import torch
+from matplotlib import pyplot
 
 import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
@@ -35,30 +36,17 @@ TORSO = (
 
 def torso(kev: float) -> Phantom:
     """Attenuation of a chest with lungs and spine in 1/mm, at an energy in keV."""
-    tissue = tissue_at(kev)
-    return Phantom(
-        tuple(
-            Solids(
-                kind,
-                torch.tensor([centre]),
-                torch.eye(3)[None],
-                torch.tensor([half]),
-                torch.tensor([water * tissue.water + bone * tissue.bone]),
-            )
-            for kind, centre, half, water, bone in TORSO
-        )
-    )
+    tissue, parts = tissue_at(kev), []
+    for kind, centre, half, water, bone in TORSO:
+        place, value = torch.tensor([[centre], [half]]), water * tissue.water + bone * tissue.bone
+        parts.append(Solids.upright(kind, *place, torch.tensor([value])))
+    return Phantom(tuple(parts))
 
 
 def activity() -> Phantom:
     """A ventricle of activity 8 about blood of 1, in a ball of 1, in the field of all pinholes."""
-    ball = Solids(
-        "ellipsoid",
-        torch.zeros(1, 3),
-        torch.eye(3)[None],
-        torch.full((1, 3), 70.0),
-        torch.ones(1),
-    )
+    size = torch.full((1, 3), 70.0)
+    ball = Solids.upright("ellipsoid", torch.zeros(1, 3), size, torch.ones(1))
     return Phantom((ball, *ventricle(value=7.0, **HEART).parts))
 
 
@@ -67,8 +55,7 @@ def transmission() -> torch.Tensor:
     ring = mv.circular(
         n_views=40, sid=300.0, sdd=500.0, detector={"pixels": [72, 72], "pixel_mm": 9.0}
     )
-    phantom = torso(CT_KEV)
-    integrals = phantom.integrals(*ring.rays(), ray_extent=ring.ray_extent).float()
+    integrals = torso(CT_KEV).views(ring).float()
     noise = torch.Generator().manual_seed(0)
     photons = torch.poisson(PHOTONS * torch.exp(-integrals), generator=noise).clamp(min=1)
     views = -torch.log(photons / PHOTONS)[None, None]
@@ -136,11 +123,6 @@ def measure(out: Path) -> None:
 
 def draw_planes(file: Path, volumes: dict, true: torch.Tensor, estimated: torch.Tensor) -> None:
     """Middle planes of the activities, and of both attenuations."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     figure = pyplot.figure(figsize=(8, 4.8), layout="constrained")
     above, below = figure.subfigures(2, 1)
     edge = GRID.size[0] * GRID.spacing[0] / 2

@@ -1,12 +1,11 @@
 """Processor time of a training step of the networks of this study, measured alternately, one
 thread:
-python experiments/21_faults/step.py --out experiments/21_faults/step.csv
+python experiments/21_faults/step.py experiments/21_faults/step.csv
 """
 
-import argparse
 import statistics
+import sys
 import time
-from pathlib import Path
 
 import torch
 
@@ -29,11 +28,8 @@ METHODS = {
 BATCH, ROUNDS = 4, 12
 
 
-def main() -> None:
+def main(out: str) -> None:
     """Time a step of each method in each round."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
-    given = parser.parse_args()
     torch.set_num_threads(1)
     grid = mv.Grid.centred(size=(32, 32, 32), spacing=(16.0, 10.0, 12.0))
     detector = {"pixels": [48, 48], "pixel_mm": [18.0, 20.0]}
@@ -62,8 +58,8 @@ def main() -> None:
         }
         for name, times in seconds.items()
     ]
-    write_rows(given.out, rows)
+    write_rows(out, rows)
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1])

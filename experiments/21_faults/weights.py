@@ -1,9 +1,8 @@
 """What could weights of cameras gain? SIRT in which faulty cameras count less, by the truth:
-python experiments/21_faults/weights.py data --out experiments/21_faults/weights.csv
+python experiments/21_faults/weights.py data experiments/21_faults/weights.csv
 """
 
-import argparse
-from pathlib import Path
+import sys
 
 import torch
 
@@ -39,14 +38,15 @@ MEASUREMENT = {
 
 
 @torch.no_grad()
-def main() -> None:
-    """Reconstruct every test case of `experiment=open_kbp_faults` with several weights."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("folder", help="folder with the files of scripts/data/prepare_openkbp.py")
-    parser.add_argument("--out", type=Path, required=True, help="CSV file to write")
-    given = parser.parse_args()
+def main(folder: str, out: str) -> None:
+    """Reconstruct every test case of `experiment=open_kbp_faults` with several weights.
+
+    Args:
+        folder: with the files of scripts/data/prepare_openkbp.py.
+        out: CSV file to write.
+    """
     scenes = {
-        part: {"name": "hdf5", "orientation": "LPI", "path": f"{given.folder}/openkbp_{file}.h5"}
+        part: {"name": "hdf5", "orientation": "LPI", "path": f"{folder}/openkbp_{file}.h5"}
         for part, file in (("train", "train"), ("test", "val"))
     }
     data = SceneData(scenes, MEASUREMENT, sizes={"train": 8, "val": 8, "test": 33})
@@ -67,8 +67,8 @@ def main() -> None:
                 error = (volume - batch["volume"]).square().mean().sqrt()
                 psnr = 20 * torch.log10(data.data_range / error).item()
                 rows.append({"case": case, "views": name, "weight": weight, "psnr": round(psnr, 4)})
-    write_rows(given.out, rows)
+    write_rows(out, rows)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

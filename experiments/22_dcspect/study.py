@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from matplotlib import pyplot as plt
 from torch import Tensor
 
 import mvrecon as mv
@@ -277,11 +278,6 @@ def picture(runs: Mapping[str, list[Path]], tuning: Path, out: Path) -> None:
     """The axial plane through the heart of one test case: truth, BSREM and the networks; anterior
     up, the patient's right on the left.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     titles = {"bsrem": "BSREM", "world_unet": "volume U-Net", "cross_view": "cross-view"}
     rows = {}
     for faults, folders in runs.items():

@@ -2,7 +2,6 @@
 unequal pixels: `python study.py NEUTRON.tif SCAN.nxs OUT`, with the commands' volumes in OUT.
 """
 
-import csv
 import json
 import sys
 from pathlib import Path
@@ -15,11 +14,13 @@ from matplotlib import pyplot as plt
 import mvrecon as mv
 from mvrecon.apps.rig_checks import FINAL_ITERATIONS, SomeViews, coarse_grid
 from mvrecon.apps.scan import Scan
+from mvrecon.core.files.runs import write_rows
 from mvrecon.data.projections.rings import without_rings
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.volume_files import read_volume
 from mvrecon.geometry.cameras.field import auto_grid
 
+HERE = Path(__file__).parent
 #: Grey value without an object, pixel size in mm, and the columns by which the axis is left of the
 #: middle.
 FLAT, PITCH, AXIS = 46811, 0.05, 6.05
@@ -93,36 +94,19 @@ def neutron(file, out):
         expected = fbp(sinogram[:-1], angles[:-1], axis, len(slices[name]), PITCH)
         y, x = np.mgrid[: len(expected), : len(expected)] - (len(expected) - 1) / 2
         off, correlation = compared(slices[name], expected, np.hypot(x, y) < 220)
-        rows.append(
-            (
-                name,
-                off,
-                correlation,
-                middle - mirrored(sinogram),
-                rings(slices[name]),
-            )
-        )
+        row = {"correction": name, "difference from NumPy": off, "correlation": correlation}
+        row["axis by mirrored views"] = middle - mirrored(sinogram)
+        rows.append({**row, "rings": rings(slices[name])})
         if name == "found":
-            aside = [middle - mirrored(sinogram, slice(k, k + 46)) for k in range(0, 229, 46)]
             found = json.loads((out / "calibrated" / "results.json").read_text())["calibration"]
-            with (Path(__file__).parent / "axis.csv").open("w", newline="") as lines:
-                csv.writer(lines).writerows(
-                    [
-                        ("by", "columns aside"),
-                        ("calibrate=[offset_u]", found["offset_px"][0][0]),
-                        ("mirrored views", rows[-1][3]),
-                        *((f"mirrored views, group {n}", c) for n, c in enumerate(aside, 1)),
-                    ]
-                )
-    with (Path(__file__).parent / "neutron.csv").open("w", newline="") as lines:
-        head = (
-            "correction",
-            "difference from NumPy",
-            "correlation",
-            "axis by mirrored views",
-            "rings",
-        )
-        csv.writer(lines).writerows([head, *rows])
+            aside = {"calibrate=[offset_u]": found["offset_px"][0][0]}
+            aside["mirrored views"] = row["axis by mirrored views"]
+            for n, k in enumerate(range(0, 229, 46), 1):
+                some = mirrored(sinogram, slice(k, k + 46))
+                aside[f"mirrored views, group {n}"] = middle - some
+            by = [{"by": name, "columns aside": value} for name, value in aside.items()]
+            write_rows(HERE / "axis.csv", by)
+    write_rows(HERE / "neutron.csv", rows)
     draw("neutron.png", {SHOWN[name]: x for name, x in slices.items()}, -0.1, 0.8)
 
 
@@ -152,10 +136,8 @@ def synchrotron(file, out):
     y, x = np.mgrid[: found.shape[1], : found.shape[2]] - (found.shape[1] - 1) / 2
     inside = np.broadcast_to(np.hypot(x, y) < columns / 2 - 2, found.shape)
     off, correlation = compared(found, expected, inside)
-    with (Path(__file__).parent / "synchrotron.csv").open("w", newline="") as lines:
-        csv.writer(lines).writerows(
-            [("scan", "difference from NumPy", "correlation"), ("K11", off, correlation)]
-        )
+    row = {"scan": "K11", "difference from NumPy": off, "correlation": correlation}
+    write_rows(HERE / "synchrotron.csv", [row])
 
 
 def unexplained(file):
@@ -171,14 +153,14 @@ def unexplained(file):
 
     scan = Scan(measured, rig(), auto_grid(rig()), {"name": "radon"})
     seen = SomeViews.of(scan, coarse_grid(scan))
-    rows = [("change", "value", "view NRMSE")]
+    rows = []
     for name, values in (("shift", range(-6, 7, 2)), ("arc", (90, 135, 180.06, 225, 270, 360))):
         for value in values:
             cameras = rig(**{name: float(value)})[seen.numbers]
             squares = seen.squares(seen.region.seen_by(cameras), FINAL_ITERATIONS)
-            rows.append((name, value, squares.sum().sqrt().item()))
-    with (Path(__file__).parent / "unexplained.csv").open("w", newline="") as lines:
-        csv.writer(lines).writerows(rows)
+            left = squares.sum().sqrt().item()
+            rows.append({"change": name, "value": value, "view NRMSE": left})
+    write_rows(HERE / "unexplained.csv", rows)
 
 
 def simulated():
@@ -196,17 +178,15 @@ def simulated():
     gain, rows, slices = rng.normal(1, 0.03, columns), [], {}
     for scan, values in (("equal", light), ("unequal", light * gain)):
         views_of = torch.from_numpy(-np.log(values)).float()[:, None]
-        for rings_by in (None, "gains", "sorting"):
-            fixed = views_of if rings_by is None else without_rings(views_of, rings_by, 2)
+        for rings_by in ("none", "gains", "sorting"):
+            fixed = views_of if rings_by == "none" else without_rings(views_of, rings_by, 2)
             found = fbp(fixed[:, 0].double().numpy(), degrees, (columns - 1) / 2, 240, 1.0)
             off = (found - truth)[np.hypot(*place) < 110]
-            rows.append((scan, rings_by or "none", np.sqrt((off**2).mean()), rings(found)))
-            slices[scan, rings_by or "none"] = found
-    with (Path(__file__).parent / "rings.csv").open("w", newline="") as lines:
-        csv.writer(lines).writerows([("pixels", "rings", "rms error", "rings left"), *rows])
-    shown = [slices["unequal", name] for name in ("none", "gains", "sorting")]
-    names = ("as measured", SHOWN["gains"], SHOWN["sorting"])
-    draw("rings.png", dict(zip(names, shown, strict=True)), 0, 0.04, "attenuation (1/pixel)")
+            row = {"pixels": scan, "rings": rings_by, "rms error": np.sqrt((off**2).mean())}
+            rows.append({**row, "rings left": rings(found)})
+            slices[SHOWN.get(rings_by, "as measured")] = found  # at last of unequal pixels
+    write_rows(HERE / "rings.csv", rows)
+    draw("rings.png", slices, 0, 0.04, "attenuation (1/pixel)")
 
 
 def draw(name, slices, low, high, quantity="attenuation (1/mm)"):
@@ -218,7 +198,7 @@ def draw(name, slices, low, high, quantity="attenuation (1/mm)"):
         panel.set(title=title, xlabel="x (pixels)")
     panels[0].set_ylabel("y (pixels)")
     figure.colorbar(shown, ax=panels, label=quantity, shrink=0.8)
-    figure.savefig(Path(__file__).with_name(name))
+    figure.savefig(HERE / name)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 from derenzo import contrasts
+from matplotlib import pyplot
 
 from mvrecon.core.files.runs import write_rows
 
@@ -30,11 +31,6 @@ PANELS = [
 
 def draw(volumes: dict[tuple, torch.Tensor], file: Path) -> None:
     """Sums along the rods, all in one scale."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     flat = {key: volumes[key].sum(dim=0) * 1.5 for key in PANELS if key in volumes}
     top = torch.stack(list(flat.values())).quantile(0.996).item()
     figure, axes = pyplot.subplots(3, 4, figsize=(8, 6.6), layout="constrained")

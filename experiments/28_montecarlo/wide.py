@@ -21,10 +21,8 @@ def rig() -> mv.Cameras:
 
 def phantom() -> Phantom:
     """Balls of activity one."""
-    n = len(RADII)
-    sizes = torch.tensor(RADII)[:, None].expand(n, 3)
-    turns = torch.eye(3).expand(n, 3, 3)
-    return Phantom((Solids("ellipsoid", torch.tensor(CENTRES) * 1.0, turns, sizes, torch.ones(n)),))
+    centres, sizes = torch.tensor(CENTRES) * 1.0, torch.tensor(RADII)[:, None].expand(-1, 3)
+    return Phantom((Solids.upright("ellipsoid", centres, sizes, torch.ones(len(sizes))),))
 
 
 def rows(version: str, build: Callable[[float], LinearOperator], folder: Path) -> list[dict]:

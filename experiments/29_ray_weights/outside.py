@@ -6,7 +6,6 @@ A row for each test case of each run's main method: PSNR and SSIM of its volume,
 volume with values below `AIR` set to zero.
 """
 
-import csv
 import sys
 from itertools import chain
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import torch
 
 import mvrecon as mv
+from mvrecon.core.files.runs import write_rows
 from mvrecon.data.dataset import single_cases
 from mvrecon.report.metrics import psnr, ssim
 from mvrecon.training.fit import build_data
@@ -27,23 +27,21 @@ AIR = 5e-4
 def main(out: Path, folders: list[Path]) -> None:
     """Reconstruct and measure."""
     torch.set_num_threads(1)
-    with out.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["views", "case", "psnr", "ssim", "psnr_cut", "ssim_cut", "share_cut"])
-        for folder in folders:
-            settings = read_settings(folder)
-            data, network = build_data(settings), mv.load(folder)
-            data.setup("test")
-            for case in chain.from_iterable(map(single_cases, data.test_dataloader())):
-                A = network.module.operator(case)
-                volume = network.module(case["views"], A).volume[0]
-                truth, inside = case["volume"][0], case["inside"][0]
-                cut = torch.where(volume < AIR, 0, volume)
-                row = [folder.parent.name, case["name"][0]]
-                for x in (volume, cut):
-                    row += [f"{f(x, truth, inside, data.data_range):.4f}" for f in (psnr, ssim)]
-                share = ((volume > 0) & (volume < AIR) & ~inside).sum() / (~inside).sum()
-                writer.writerow([*row, f"{share.item():.3f}"])
+    rows = []
+    for folder in folders:
+        data, network = build_data(read_settings(folder)), mv.load(folder)
+        data.setup("test")
+        for case in chain.from_iterable(map(single_cases, data.test_dataloader())):
+            volume = network.module(case["views"], network.module.operator(case)).volume[0]
+            truth, inside = case["volume"][0], case["inside"][0]
+            row = {"views": folder.parent.name, "case": case["name"][0]}
+            for end, x in (("", volume), ("_cut", torch.where(volume < AIR, 0, volume))):
+                for figure in (psnr, ssim):
+                    value = figure(x, truth, inside, data.data_range)
+                    row[f"{figure.__name__}{end}"] = f"{value:.4f}"
+            share = ((volume > 0) & (volume < AIR) & ~inside).sum() / (~inside).sum()
+            rows.append({**row, "share_cut": f"{share.item():.3f}"})
+    write_rows(out, rows)
 
 
 if __name__ == "__main__":

@@ -59,12 +59,7 @@ def ellipsoids(rng: torch.Generator, high: bool, wider: float = 1.0) -> Phantom:
         radii = [FIELD * uniform(rng, 0.06, 0.25) for _ in "xyz"]
         parts.append((x, y, uniform(rng, -15, 15), *radii, uniform(rng, -0.015, 0.03)))
     x, scale = torch.tensor(parts).double(), torch.tensor([wider, wider, 1.0]).double()
-    turns = torch.eye(3).double().expand(len(x), 3, 3)
-    return Phantom((Solids("ellipsoid", scale * x[:, :3], turns, scale * x[:, 3:6], x[:, 6]),))
-
-
-def views_of(phantom: Phantom, rig: mv.Cameras) -> torch.Tensor:
-    return phantom.integrals(*rig.rays(), rig.ray_extent).float()
+    return Phantom((Solids.upright("ellipsoid", scale * x[:, :3], scale * x[:, 3:6], x[:, 6]),))
 
 
 def checked(seed: int) -> dict:
@@ -103,10 +98,10 @@ def checked(seed: int) -> dict:
         true = misaligned(rig, by)
     if fault == "sdd 10 % long":
         stated = rig_of(beam, count, true_arc, 660.0)
-    views = views_of(phantom, true)
+    views = phantom.views(true).float()
     if fault == "object moves":
         moved = phantom.moved(torch.eye(3).double(), torch.tensor([6.0, 3.0, 0.0]).double())
-        views[count // 2 :] = views_of(moved, true)[count // 2 :]
+        views[count // 2 :] = moved.views(true)[count // 2 :]
     if fault == "gains":
         views = views * (1 + 0.1 * torch.randn(count, 1, 1, generator=rng))
     noise = one_of(rng, (0.0, 0.01, 0.03))
@@ -164,7 +159,7 @@ def distances() -> list[dict]:
             f"ellipsoids {n}": ellipsoids(rng, beam == "cone") for n in (1, 2)
         }
         for name, phantom in objects.items():
-            y = views_of(phantom, rig)[None, None]
+            y = phantom.views(rig)[None, None].float()
             for factor in (0.9, 0.95, 1.0, 1.1, 1.2, 1.3):
                 stated = rig_of(beam, 60, 360.0, 600.0 * factor)
                 A = mv.Drr(auto_grid(stated), stated)

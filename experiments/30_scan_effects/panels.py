@@ -15,6 +15,8 @@ import mvrecon as mv
 from mvrecon.core.files.runs import write_rows
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.grid import voxel_centres
+from mvrecon.geometry.rigid import unit
+from mvrecon.operators.stacked import joined_cameras
 
 VALUE, RADIUS, CENTRE = 0.02, 40.0, (3.0, -5.0, 0.0)
 GRID = mv.Grid.centred(size=(64, 64, 1), spacing=1.8)
@@ -36,22 +38,12 @@ def beam(detector: dict, angles: torch.Tensor) -> mv.Cameras:
 
 def shifted(rig: mv.Cameras, mm: torch.Tensor) -> mv.Cameras:
     """Each panel moved along its rows by its own distance."""
-    u = torch.nn.functional.normalize(rig.u, dim=1)
-    return replace(rig, origin=rig.origin + mm.double()[:, None] * u)
+    return replace(rig, origin=rig.origin + mm.double()[:, None] * unit(rig.u))
 
 
 def blocks(count: int) -> mv.Cameras:
     """Half fans of either side by turns, in blocks of so many views."""
     return shifted(fan(panel(66, 2.0), TURN), 35.0 - 70.0 * (TURN // count % 2))
-
-
-def joined(one: mv.Cameras, other: mv.Cameras) -> mv.Cameras:
-    """The views of one scan and another."""
-    parts = {
-        name: torch.cat([getattr(one, name), getattr(other, name)])
-        for name in ("source", "origin", "u", "v")
-    }
-    return replace(one, **parts)
 
 
 def jittered(mm: float) -> mv.Cameras:
@@ -67,16 +59,20 @@ SCANS = {
         fan(panel(66, 2.0), TURN), torch.tensor([35.0, -30.0]).repeat(180)
     ),
     **{
-        f"half fan, and full fan over {n} degrees": joined(fan(HALF, TURN), fan(FULL, TURN[:n]))
+        f"half fan, and full fan over {n} degrees": joined_cameras(
+            [fan(HALF, TURN), fan(FULL, TURN[:n])]
+        )
         for n in (120, 210, 300)
     },
-    "half fan, and 210 degrees of the other half": joined(
-        fan(HALF, TURN), fan(panel(100, 1.32, -35.0), TURN[50:260] + 0.5)
+    "half fan, and 210 degrees of the other half": joined_cameras(
+        [fan(HALF, TURN), fan(panel(100, 1.32, -35.0), TURN[50:260] + 0.5)]
     ),
-    "short scans of two widths": joined(fan(FULL, TURN[:210]), fan(panel(100, 2.4), TURN[150:360])),
+    "short scans of two widths": joined_cameras(
+        [fan(FULL, TURN[:210]), fan(panel(100, 2.4), TURN[150:360])]
+    ),
     **{
-        f"parallel, half and full panel over 180 degrees each, {words}": joined(
-            beam(panel(80, 1.0, 25.0), TURN[:180]), beam(panel(128, 1.0), TURN[:180] + apart)
+        f"parallel, half and full panel over 180 degrees each, {words}": joined_cameras(
+            [beam(panel(80, 1.0, 25.0), TURN[:180]), beam(panel(128, 1.0), TURN[:180] + apart)]
         )
         for words, apart in (("at the same angles", 0.0), ("half a degree apart", 0.5))
     },
@@ -91,13 +87,12 @@ SCANS = {
 
 def main(folder: Path) -> None:
     """Greatest and mean error in per cent within 30 mm of the cylinder's axis."""
-    size, turn = torch.tensor([[RADIUS, RADIUS, 150.0]]), torch.eye(3)[None]
-    centre = torch.tensor([CENTRE])
-    cylinder = Phantom((Solids("cylinder", centre, turn, size, torch.tensor([VALUE])),))
+    size, centre = torch.tensor([[RADIUS, RADIUS, 150.0]]), torch.tensor([CENTRE])
+    cylinder = Phantom((Solids.upright("cylinder", centre, size, torch.tensor([VALUE])),))
     inside = (voxel_centres(GRID) - centre[0])[..., :2].norm(dim=-1) < 30.0
     rows = []
     for name, rig in SCANS.items():
-        views = cylinder.integrals(*rig.rays(), rig.ray_extent)[None, None].float()
+        views = cylinder.views(rig)[None, None].float()
         A = mv.Radon(GRID, rig) if rig.parallel else mv.Drr(GRID, rig)
         row: dict = {"scan": name, "greatest": "", "mean": "", "said": "error"}
         with warnings.catch_warnings(record=True) as caught:

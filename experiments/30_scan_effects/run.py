@@ -68,13 +68,11 @@ def ellipsoids(solids: list) -> Phantom:
     x, y, a, b, values = torch.tensor(solids, dtype=torch.float32).T
     centres = torch.stack([x, y, 0 * x], dim=1)
     sizes = torch.stack([a, b, torch.maximum(a, b)], dim=1)
-    return Phantom(
-        (Solids("ellipsoid", centres, torch.eye(3).expand(len(x), 3, 3), sizes, values),)
-    )
+    return Phantom((Solids.upright("ellipsoid", centres, sizes, values),))
 
 
 def views_of(phantom: Phantom, rig: mv.Cameras) -> torch.Tensor:
-    return phantom.integrals(*rig.rays(), rig.ray_extent)[None, None].float()
+    return phantom.views(rig)[None, None].float()
 
 
 def operator(rig: mv.Cameras, grid: mv.Grid) -> mv.Drr | mv.Radon:
@@ -152,7 +150,6 @@ def hardening() -> list[dict]:
     views.
     """
     rows = []
-    turn = torch.eye(3)[None]
     for beam, rig in {
         "parallel": mv.parallel(120, panel(160, 1.5), depth_mm=900.0),
         "fan": mv.circular(120, 500.0, 750.0, panel(160, 2.25)),
@@ -163,11 +160,10 @@ def hardening() -> list[dict]:
         for kv in (80.0, 120.0):
             coefficients: list[float] = []
             for radius in (100.0, 60.0):
-                sizes, middle = (
-                    torch.tensor([[radius, radius, 400.0]]),
-                    torch.tensor([[5.0, -3, 0]]),
-                )
-                water = Phantom((Solids("cylinder", middle, turn, sizes, torch.tensor([0.01929])),))
+                place = [[5.0, -3.0, 0.0]], [[radius, radius, 400.0]]
+                middle, sizes = map(torch.tensor, place)
+                solid = Solids.upright("cylinder", middle, sizes, torch.tensor([0.01929]))
+                water = Phantom((solid,))
                 rng = torch.Generator().manual_seed(1)
                 p = -tube(kv).transmission(views_of(water, rig).double()).log()
                 p = (p + 0.01 * torch.randn(p.shape, generator=rng)).float()

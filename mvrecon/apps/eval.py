@@ -80,7 +80,7 @@ def evaluate(options: EvalSettings, folder: Path) -> Results:
         check_room(folder / "cases", BYTES_PER_VOXEL * voxels * (1 + len(ready.trained)))
     check_coverage(data.cameras, data.grid, bodies=data.first_volumes())
     with run_folder.run_lock(folder, vars(options), EVALUATION):
-        table = evaluation.results(settings, run, data, device, on_scene, other_rig, ready)
+        table = evaluation.results(settings, run, data, device, on_scene, ready)
         table["checkpoint"] = str(run)
         table["acquisition_of_run"] = trained.acquisition
         table["geometry"] = {"camera": settings.camera, "grid": settings.grid}

@@ -188,9 +188,8 @@ class Interval(NamedTuple):
     high: float
 
 
-def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
-    """Return the mean of independent normal values and its confidence interval at `level` (Student
-    1908).
+def mean_interval(values: Sequence[float]) -> Interval:
+    """Return the mean of independent normal values and its 95 % confidence interval (Student 1908).
 
     The mean is nan if any value is, and for no value.
     """
@@ -198,7 +197,7 @@ def mean_interval(values: Sequence[float], level: float = 0.95) -> Interval:
     if len(values) < 2 or not math.isfinite(mean):
         return Interval(mean, math.nan, math.nan)
     error = statistics.stdev(values) / math.sqrt(len(values))
-    half = t_quantile(level, len(values) - 1) * error
+    half = t_quantile(0.95, len(values) - 1) * error
     return Interval(mean, mean - half, mean + half)
 
 
@@ -237,8 +236,8 @@ LATEX_SPECIAL = re.compile(r"([&%$#_{}])")
 class Cells(NamedTuple):
     """Headings and rows of texts."""
 
-    head: list[str]
-    body: list[list[str]]
+    head: Sequence[str]
+    body: Sequence[Sequence[str]]
 
 
 def difference(row: Row, reference: Row, metric: str) -> Interval:
@@ -339,9 +338,9 @@ def terminal(table: Cells) -> Table:
     return shown
 
 
-def markdown(table: Cells) -> str:
-    """Format as Markdown."""
-    rule = ["---", "---", *["---:"] * (len(table.head) - 2)]
+def markdown(table: Cells, texts: int = 2) -> str:
+    """Format as Markdown; all columns but the first `texts` are set to the right."""
+    rule = ["---"] * texts + ["---:"] * (len(table.head) - texts)
     lines = [[cell.replace("|", r"\|") for cell in row] for row in (table.head, rule, *table.body)]
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 

@@ -40,17 +40,11 @@ def tell(line: str) -> None:
 
 
 class StepProgress(ProgressBar):
-    """One line for each method: steps, elapsed and remaining time, loss, last validation PSNR.
+    """One line for each method: steps, elapsed and remaining time, loss, last validation PSNR."""
 
-    Args:
-        label: label of the method in the run's table; "" if not yet known.
-    """
-
-    def __init__(self, label: str = "") -> None:
-        super().__init__()
-        self.label = label
-        self._lines: progress.Progress | None = None
-        self._shown = True
+    label = ""  # of the method in the run's table
+    _lines: progress.Progress | None = None
+    _shown = True
 
     def disable(self) -> None:
         """Hide the line, as in all but the first of several processes."""

@@ -109,23 +109,14 @@ def evaluate(
     return scores
 
 
-def load_methods(settings: TrainSettings, folder: Path, data_range: float) -> dict[str, Trained]:
-    """Load every method of a run: from its checkpoint, or newly built if it has no trainable
-    weights.
-
-    Raises:
-        FileNotFoundError: training of a method has not finished.
-    """
-    methods = settings.methods()
-    return {
-        label: _method(settings, folder, label, model, data_range)
-        for label, model in methods.items()
-    }
-
-
 def _method(
     settings: TrainSettings, folder: Path, label: str, model: Options, data_range: float
 ) -> Trained:
+    """A method of a run, from its checkpoint, or newly built if it has no trainable weights.
+
+    Raises:
+        FileNotFoundError: its training has not finished.
+    """
     path = finished(folder, label)
     fresh = None if path.exists() else build_module(settings, model, data_range)
     return load_checkpoint(path) if fresh is None or trainable(fresh) else Trained(fresh, 0.0, 0)
@@ -149,16 +140,24 @@ class Loaded:
 def loaded(
     settings: TrainSettings, folder: Path, data: SceneData, other_rig: bool = False
 ) -> Loaded:
-    """Load the methods of a run and build their operators, and compute the test cases of `data`;
-    arguments and errors as of `results`.
+    """Load the methods of a run and build their operators, and compute the test cases of `data`.
+
+    Args:
+        settings: settings of the run, or of an evaluation.
+        folder: folder of the run.
+        data: data with the test scenes.
+        other_rig: allow another rig and grid, those of `settings`, than in training.
+
+    Raises:
+        FileNotFoundError: training of a method has not finished.
+        Refused: a method trained with another rig without `other_rig`, or with other contents of a
+            file.
     """
-    trained = load_methods(settings, folder, data.data_range)
-    for label, method in trained.items():
+    geometry, trained, assumed = (settings.grid, settings.camera), {}, {}
+    for label, model in settings.methods().items():
+        one = trained[label] = _method(settings, folder, label, model, data.data_range)
         known = data.digests("test", rig=not other_rig)
-        digests.compare(known, method.digests, finished(folder, label))
-    geometry = settings.grid, settings.camera
-    assumed = {}
-    for label, one in trained.items():
+        digests.compare(known, one.digests, finished(folder, label))
         projector = one.module.hparams["geometry"]["projector"]
         if projector != settings.projector:
             assumed[label] = build_projector(*geometry, projector)
@@ -172,27 +171,20 @@ def results(
     data: SceneData,
     device: str = "cpu",
     on_scene: SceneCallback | None = None,
-    other_rig: bool = False,
     ready: Loaded | None = None,
 ) -> Results:
     """Compute the result table of a run: its checkpoints evaluated on the test scenes of `data`.
 
     Args:
-        settings: settings of the run, or of an evaluation.
-        folder: folder of the run.
-        data: data with the test scenes.
+        settings, folder, data: see `loaded`.
         device: device of the methods.
         on_scene: called with every scene and its reconstructions by label.
-        other_rig: allow another rig and grid, those of `settings`, than in training.
         ready: what `loaded` returns; None: load it.
 
     Raises:
-        FileNotFoundError: training of a method has not finished.
-        ValueError: weights that do not fit the rig or the grid.
-        Refused: a method trained with another rig without `other_rig`, or with other contents of a
-            file.
+        ValueError: weights that do not fit the rig or the grid; and as `loaded`.
     """
-    ready = ready or loaded(settings, folder, data, other_rig)
+    ready = ready or loaded(settings, folder, data)
     trained = ready.trained
     methods = {label: one.module.method for label, one in trained.items()}
     names: list[str] = []

@@ -45,17 +45,16 @@ class TensorBoardReview(L.Callback):
         every: number of validations between sheets.
         cases: number of scenes, from the first batch.
         baselines: training-free methods for comparison.
-        label: label of the method in the run's table; "": its class's name.
     """
+
+    label = ""  # of the method in the run's table; "": its class's name
 
     def __init__(
         self,
         every: PositiveInt = 1,
         cases: NonNegativeInt = 2,
         baselines: Sequence[str] = ("backprojection", "sirt"),
-        label: str = "",
     ):
-        self.label = label
         self.every, self.cases, self.baselines = every, cases, tuple(baselines)
         self.n_validations = 0
         self._fixed: list[dict[str, Tensor]] = []
@@ -188,14 +187,7 @@ def _writers(trainer: L.Trainer) -> list[Any]:
 
 #: Settings without effect on results, or replaced by `method`.
 IGNORED_SETTINGS = (
-    "name",
-    "resume",
-    "plugins",
-    "callbacks",
-    "logger",
-    "compare",
-    "method",
-    "label",
+    *("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label"),
 )
 #: Figures of the table by their names in the results; costs, and theirs.
 TABLE_FIGURES = ("psnr", "ssim", "view_nrmse")

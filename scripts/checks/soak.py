@@ -11,6 +11,7 @@ import gc
 import json
 import logging
 import os
+import statistics
 import tempfile
 import time
 import warnings
@@ -50,16 +51,6 @@ def once(turn: int) -> None:
         evaluation.evaluate(EvalSettings(**settings), Path(folder) / "eval")
 
 
-def growth(megabytes: list[float]) -> float:
-    """MB a round by which memory grows: the slope of the line through all rounds after the first
-    (least squares).
-    """
-    kept = megabytes[WARM:]
-    middle, mean = (len(kept) - 1) / 2, sum(kept) / len(kept)
-    above = sum((i - middle) * (value - mean) for i, value in enumerate(kept))
-    return above / sum((i - middle) ** 2 for i in range(len(kept)))
-
-
 def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -76,14 +67,16 @@ def main() -> None:
         once(len(seen))
         seen.append(footprint())
     megabytes, files = [m for m, _ in seen], [f for _, f in seen[WARM:]]
+    # MB a round, by the line through all rounds after the first ones
+    growth = statistics.linear_regression(range(len(files)), megabytes[WARM:]).slope
     found = {
         "rounds": len(seen),
-        "mb_a_round": round(growth(megabytes), 4),
+        "mb_a_round": round(growth, 4),
         "mb": round(megabytes[-1]),
         "files": files[-1],
     }
     print(json.dumps(found))
-    if growth(megabytes) > given.allowed or max(files) > files[0]:
+    if growth > given.allowed or max(files) > files[0]:
         raise SystemExit(
             f"Not flat: {[round(m, 1) for m in megabytes]} MB, {[f for _, f in seen]} files"
         )

@@ -6,23 +6,25 @@ docs/trust.md and docs/stress.md. An interrupted run resumes with the next step;
 remove its file.
 """
 
-import argparse
 import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.runs import VERSIONS, write_rows
+from mvrecon.core.files.runs import VERSIONS, read_rows, write_rows
 from mvrecon.training.run_folder import versions
+from mvrecon_bench.runner import TABLE
 from mvrecon_bench.stresses.verdict import FAIL, LEFT_OUT, PASS
 
 ROOT = Path(__file__).resolve().parents[2]
 FOUND = ROOT / "docs" / "trust"
+#: Seed of all that is random, damaged files for each reader, trainings to kill, and seconds of
+#: training in a loop.
+SEED, FILES, KILLS, SOAK = 7, 9000, 72, 3600.0
 Rows = list[dict[str, Any]]
 
 
@@ -34,11 +36,11 @@ def output_of(*command: str, **environment: str) -> str:
     ).stdout
 
 
-def stress(_: argparse.Namespace) -> Rows:
+def stress() -> Rows:
     """The stress plan: the verdicts on each part, and the cases in which it failed."""
     with tempfile.TemporaryDirectory() as folder:
         output_of(sys.executable, "-m", "mvrecon_bench.stress", f"out={folder}/stress")
-        rows = json.loads((Path(folder) / "stress" / "verdicts.json").read_text())
+        rows = read_rows(Path(folder) / "stress" / TABLE)
     found: dict[tuple[str, str], dict[str, Any]] = {}
     for row in rows:
         names = {"part": row["part"], "dtype": row["dtype"]}
@@ -46,11 +48,11 @@ def stress(_: argparse.Namespace) -> Rows:
         part = found.setdefault((row["part"], row["dtype"]), empty)
         part[row["verdict"]] += 1
         if row["verdict"] == FAIL:
-            part["failed"] += f"{row['number']:.0f} {row['case']}; "
+            part["failed"] += f"{row['number']} {row['case']}; "
     return list(found.values())
 
 
-def properties(_: argparse.Namespace) -> Rows:
+def properties() -> Rows:
     """Random geometries that the properties were tried on."""
     options = ("-q", "--hypothesis-show-statistics", "-p", "no:cacheprovider")
     said = output_of(sys.executable, "-m", "pytest", "tests/properties", *options)
@@ -61,12 +63,11 @@ def properties(_: argparse.Namespace) -> Rows:
     return [{"properties": len(counted), "examples": examples, "failing": failing}]
 
 
-def fuzz(given: argparse.Namespace) -> Rows:
+def fuzz() -> Rows:
     """What became of damaged files, reader by reader."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "found.json"
-        numbers = str(given.seed), str(given.fuzz)
-        output_of(sys.executable, "-m", "tests.faults.fuzzing", *numbers, str(out))
+        output_of(sys.executable, "-m", "tests.faults.fuzzing", f"{SEED}", f"{FILES}", str(out))
         found = json.loads(out.read_text())
     return [
         {
@@ -81,47 +82,27 @@ def fuzz(given: argparse.Namespace) -> Rows:
     ]
 
 
-def kills(given: argparse.Namespace) -> Rows:
+def kills() -> Rows:
     """Trainings that were killed at random and went on."""
-    said = output_of(
-        sys.executable, "-m", "tests.training.lives", str(given.kills), str(given.seed)
-    )
+    said = output_of(sys.executable, "-m", "tests.training.lives", f"{KILLS}", f"{SEED}")
     found = json.loads(said.splitlines()[-1])
     return [{"kills": found["kills"], "differ": len(found["runs that differ"])}]
 
 
-def soak(given: argparse.Namespace) -> Rows:
+def soak() -> Rows:
     """Training and evaluating in a loop."""
-    said = output_of(sys.executable, "scripts/checks/soak.py", "--seconds", str(given.soak))
-    return [{"seconds": given.soak, **json.loads(said.splitlines()[-1])}]
-
-
-STEPS: tuple[Callable[[argparse.Namespace], Rows], ...] = (stress, properties, fuzz, kills, soak)
+    said = output_of(sys.executable, "scripts/checks/soak.py", "--seconds", f"{SOAK}")
+    return [{"seconds": SOAK, **json.loads(said.splitlines()[-1])}]
 
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--seed", type=int, default=7, help="seed of all that is random (default: 7)"
-    )
-    parser.add_argument(
-        "--fuzz", type=int, default=9000, help="damaged files for each reader (default: 9000)"
-    )
-    parser.add_argument("--kills", type=int, default=72, help="trainings to kill (default: 72)")
-    parser.add_argument(
-        "--soak",
-        type=float,
-        default=3600.0,
-        help="seconds of training in a loop (default: an hour)",
-    )
-    given = parser.parse_args()
     FOUND.mkdir(parents=True, exist_ok=True)
-    for step in STEPS:
+    for step in (stress, properties, fuzz, kills, soak):
         file = FOUND / f"{step.__name__}.csv"
         if not file.exists():
             print(f"{step.__name__}: {step.__doc__}", flush=True)
-            write_rows(file, step(given))
+            write_rows(file, step())
     made = "".join(f"{name} {versions()[name]}\n" for name in ("python", "torch", "numba"))
     (FOUND / VERSIONS).write_text(made)
     print("Now run python scripts/docs/tables.py, which writes the tables of its pages")

@@ -7,16 +7,13 @@ import sys
 from io import BytesIO
 from pathlib import Path
 
-import matplotlib
 import torch
+from matplotlib import pyplot as plt
 from PIL import Image
 from torch import Tensor
 
 import mvrecon as mv
 from mvrecon.methods.classical.solver import Iterate
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
 
 GRID = mv.Grid.centred(64, spacing=4.0)
 CAMERAS = mv.circular(24, 400.0, 800.0, {"pixels": [96, 96], "pixel_mm": 7.0})

@@ -4,9 +4,6 @@ python scripts/docs/model_diagram.py docs/images/model.svg
 
 import sys
 
-import matplotlib
-
-matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.patches import FancyBboxPatch
 

@@ -19,6 +19,10 @@ from typing import Any
 
 import matplotlib
 import torch
+from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from torch import Tensor
 
 import mvrecon as mv
@@ -33,12 +37,6 @@ from mvrecon.report.viz.rig import outlines
 from mvrecon.training.fit import build_data
 from mvrecon.training.run_folder import read_settings
 from mvrecon.training.trained import Trained
-
-matplotlib.use("Agg")
-from matplotlib import pyplot as plt
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 #: Attenuation in 1/mm at the white end of the scale: twice water's, bone's.
 WHITE = 0.04

@@ -56,7 +56,7 @@ NUMBER = re.compile(r"[-+]?\d.*")
 class Mean:
     """The mean of a group, rounded once: that of SQLite depends on its version."""
 
-    fewest = 1
+    of, fewest = statistics.fmean, 1
 
     def __init__(self) -> None:
         self.values: list[float] = []
@@ -66,19 +66,13 @@ class Mean:
             self.values.append(value)
 
     def finalize(self) -> float | None:
-        return self.of(self.values) if len(self.values) >= self.fewest else None
-
-    def of(self, values: list[float]) -> float:
-        return statistics.fmean(values)
+        return type(self).of(self.values) if len(self.values) >= self.fewest else None
 
 
 class Deviation(Mean):
     """The sample standard deviation of a group."""
 
-    fewest = 2
-
-    def of(self, values: list[float]) -> float:
-        return statistics.stdev(values)
+    of, fewest = statistics.stdev, 2
 
 
 def value_of(cell: str) -> float | str | None:

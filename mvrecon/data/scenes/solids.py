@@ -17,7 +17,9 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
+from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 
 #: The number of round axes; along the others a solid is a slab.
@@ -243,6 +245,14 @@ class Phantom:
         for part, rays in self._chunks(len(first)):
             total[rays] += part.integrals(first[rays], last[rays] - first[rays], ray_extent)
         return total.reshape(torch.broadcast_shapes(start.shape, end.shape)[:-1]).to(start.dtype)
+
+    def views(self, cameras: Cameras, rays: int = 1) -> Float[Tensor, "m v u"]:
+        """Exact views in value * mm, in float64: a pixel is the mean over rays x rays evenly
+        distributed rays.
+        """
+        fine = cameras.refined(rays)
+        exact = (self.integrals(*one.rays(), ray_extent=one.ray_extent) for one in fine)
+        return torch.cat([avg_pool2d(view, rays) for view in exact])
 
     def values(self, xyz: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n"]:
         """Value at world points in mm, in the dtype of `xyz`."""

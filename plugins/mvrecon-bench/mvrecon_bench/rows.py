@@ -52,10 +52,8 @@ class Bench(ABC):
         """Short label of a row's part."""
 
     @abstractmethod
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
-        """Yield a row for each job of a group; `rows` are existing rows, `say` reports progress."""
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
+        """Yield a row for each job of a group; `say` reports progress."""
 
     def summary(self, rows: Sequence[Row], folder: Path) -> str:
         """Write the plots (PNG) to the folder and return what precedes the tables, in Markdown."""
@@ -169,14 +167,6 @@ def skipped(error: BaseException) -> Row:
 def measured(rows: Iterable[Row]) -> list[Row]:
     """The rows without an error."""
     return [row for row in rows if row["status"] == "ok"]
-
-
-def markdown(head: Sequence[str], lines: Iterable[Sequence[str]], texts: int = 1) -> str:
-    """A table; all columns but the first `texts` are right-aligned."""
-    rows = [head, ["---"] * texts + ["---:"] * (len(head) - texts), *lines]
-    return "".join(
-        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in row)} |\n" for row in rows
-    )
 
 
 def _parsed(line: Mapping[str, str]) -> Row:

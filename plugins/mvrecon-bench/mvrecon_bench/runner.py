@@ -13,9 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from mvrecon.core.files.atomic import claimed, write_text
 from mvrecon.core.files.runs import SETTINGS
+from mvrecon.report.comparison import Cells, markdown
 from mvrecon.training import run_folder
 from mvrecon.training.callbacks import TensorBoard
-from mvrecon_bench.rows import Bench, Row, Rows, check_header, figure, markdown
+from mvrecon_bench.rows import Bench, Row, Rows, check_header, figure
 
 TABLE = "results.csv"
 #: Distributions of the other compared libraries.
@@ -62,7 +63,7 @@ def run(bench: Bench, folder: Path, settings: dict[str, Any] | None = None) -> l
                 progress.update(task, description=text)
 
             for jobs in filter(None, groups):
-                for new in bench.measure(jobs, table.rows, say):
+                for new in bench.measure(jobs, say):
                     row = table.append(new)
                     for name in bench.charts:
                         if isinstance(figure := row.get(name), float):
@@ -103,11 +104,11 @@ def markdown_of(bench: Bench, rows: Sequence[Row], summary: str) -> str:
     for title, members in groups.items():
         cells = [[figure(row, *one) for one in bench.shown.items()] for row in members]
         lines = [(bench.label(row), *cell) for row, cell in zip(members, cells, strict=True)]
-        text += title + markdown(("", *bench.shown), lines)
+        text += title + markdown(Cells(("", *bench.shown), lines), 1)
     if left_out:
         lines = [(part, status, str(count)) for (part, status), count in left_out.items()]
-        text += f"\n## Left out\n\n{markdown(('part', 'status', 'cases'), lines, 2)}"
-    legend = markdown(("column", "meaning"), bench.columns.items(), 2)
+        text += f"\n## Left out\n\n{markdown(Cells(('part', 'status', 'cases'), lines))}"
+    legend = markdown(Cells(("column", "meaning"), list(bench.columns.items())))
     return f"{text}\n## Columns of results.csv\n\n{legend}"
 
 

@@ -27,7 +27,7 @@ class StressSettings:
         device: Where it computes: cpu, gpu or auto.
         dtypes: Data types of volumes and views: float64, float32, bfloat16, float16.
         limit_s: Time limit of a case in seconds.
-        out: Folder of the table and of verdicts.json.
+        out: Folder of the table.
         plugins: Modules to import first, which register parts.
     """
 
@@ -41,7 +41,7 @@ class StressSettings:
 
 
 def task(config: DictConfig) -> None:
-    """Run the app; the folder contains `verdicts.json` besides the files of `runner.run`.
+    """Run the app; see `mvrecon_bench.runner.run` for the folder.
 
     Raises:
         SystemExit: a case failed.

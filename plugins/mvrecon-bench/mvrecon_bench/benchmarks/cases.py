@@ -15,6 +15,7 @@ from mvrecon.geometry.cameras import rigs
 from mvrecon.geometry.cameras.camera import VECTORS, Cameras
 from mvrecon.geometry.cameras.rigs import DETECTOR_MM, dcspect80, modules
 from mvrecon.geometry.grid import Grid
+from mvrecon.operators.stacked import joined_cameras
 
 #: Edge of the volume in mm; smaller for the closer pinholes of DC-SPECT.
 FIELD, NEAR_FIELD = 256.0, 160.0
@@ -165,11 +166,7 @@ def _axis_aligned(case: Workload) -> Cameras:
 def _axis_parallel(case: Workload) -> Cameras:
     one = _parallel(case, 1)
     turn, still = torch.eye(3, dtype=torch.float64).roll(1, 0), torch.zeros(3, dtype=torch.float64)
-    turned = (one, one.moved(turn, still), one.moved(turn @ turn, still))
-    joined: dict[str, Any] = {
-        name: torch.cat([getattr(rig, name) for rig in turned]) for name in VECTORS
-    }
-    return replace(one, **joined)
+    return joined_cameras([one, one.moved(turn, still), one.moved(turn @ turn, still)])
 
 
 RIGS: dict[str, Callable[[Workload], Cameras]] = {

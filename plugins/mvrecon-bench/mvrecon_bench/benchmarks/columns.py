@@ -37,8 +37,8 @@ def table(names: str, **others: str) -> Mapping[str, str]:
 OPERATORS = table(
     "part method options backend device dtype threads scene camera n ratio views pixels rays status"
     " note error_thin error_pixel floor_thin floor_pixel forward_ms adjoint_ms volume_grad_ms"
-    " pose_grad_ms first_ms calls forward_ratio adjoint_ratio volume_grad_ratio pose_grad_ratio"
-    " peak_mb adjoint_peak_mb ray_slabs_per_s adjointness repeatable nans pose_cosine load",
+    " pose_grad_ms first_ms calls peak_mb adjoint_peak_mb adjointness repeatable nans pose_cosine"
+    " load",
     pixels="rows x columns of each detector",
     rays="views x pixels",
     error_thin="|A x - t| / |t| over all pixels, t the exact integrals along their central rays",
@@ -48,12 +48,7 @@ OPERATORS = table(
     volume_grad_ms="forward and backward to the volume, in ms, likewise",
     pose_grad_ms="forward and backward to the cameras, in ms, likewise",
     first_ms="the first forward call in ms, with compilation and loading of kernels",
-    forward_ratio="forward_ms / that of the first part of the list, timed alternately",
-    adjoint_ratio="adjoint_ms / that of the first part, likewise",
-    volume_grad_ratio="volume_grad_ms / that of the first part, likewise",
-    pose_grad_ratio="pose_grad_ms / that of the first part, likewise",
     adjoint_peak_mb="peak_mb of an adjoint call",
-    ray_slabs_per_s="rays x n / forward time; nominal, as if nothing were skipped",
     adjointness="|<A x, y> - <x, A^T y>| / (|A x| |y|) for random x and y",
     repeatable="whether two calls of forward and adjoint are bitwise equal",
     nans="values that are NaN or infinite in views, adjoint and both gradients",
@@ -70,11 +65,9 @@ SCALING = table(
 )
 METHODS = table(
     "part options scene camera n slices ratio views device dtype threads status error ms"
-    " iterations_timed peak_mb peer over_peer calls load",
+    " peak_mb peer over_peer calls load",
     slices="voxels along z; 0: n",
     error="|x - t| / |t| over the voxels of the object, t the mean of the phantom in each voxel",
-    iterations_timed="blank: the whole run; else ms is scaled from so many iterations, of a run "
-    "that would take longer than `limit_s`, and there is no error",
     peer="the part for `over_peer`",
     over_peer="ms / that of the peer",
 )
@@ -104,11 +97,10 @@ SKIP = table(
     differing="number of values that are not bitwise equal to those of off",
 )
 PRECISION = table(
-    "task precision n device threads status error worst not_finite ms ratio peak_mb calls load",
+    "task precision n device threads status error not_finite ms ratio peak_mb calls load",
     task="the computation",
     precision="storage of volumes and views",
     error="|y - t| / |t|, t in float64 from unrounded operands",
-    worst="greatest absolute error / greatest absolute value of t",
     not_finite="values that are NaN or infinite",
     ratio="ms / that of float32",
 )

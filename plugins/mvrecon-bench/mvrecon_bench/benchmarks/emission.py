@@ -65,9 +65,7 @@ class Emission(Bench):
     def label(self, row: Row) -> str:
         return f"{row['model']}, {row['method']}"
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """Yield the rows of models after timing them alternately with the plain one."""
         away = voxel_centres(self.grid)[..., :2].norm(dim=-1)
         inside = (away < BODY * self.grid.size[0] * self.grid.spacing[0]).float()

@@ -17,7 +17,6 @@ from mvrecon.testing.measures import gap
 from mvrecon_bench.benchmarks.cases import Workload, case_label, expand
 from mvrecon_bench.benchmarks.columns import METHODS
 from mvrecon_bench.benchmarks.trial import Part, part_label
-from mvrecon_bench.benchmarks.truth import pixel_mean
 from mvrecon_bench.measure import interleaved, load_average, once, threads, with_memory
 from mvrecon_bench.rows import Bench, Job, Row, skipped
 
@@ -38,7 +37,7 @@ class MethodInputs(NamedTuple):
 def measurement_of(case: Workload, rays: int) -> MethodInputs:
     """Views as means of rays x rays exact integrals per pixel, and the truth of a case."""
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
-    views = pixel_mean(phantom, rig, rays)[None, None].float()
+    views = phantom.views(rig, rays)[None, None].float()
     volume = voxelise(phantom, grid).float()
     return MethodInputs(RayTransform(grid, rig), views, volume, volume > 0)
 
@@ -53,8 +52,6 @@ class Methods(Bench):
         rays: a pixel is the mean of rays x rays exact integrals.
         repeats: minimum number of calls per median time.
         once_s: longer calls, in seconds, are timed once.
-        limit_s: time limit of a method in seconds; the time of slower methods is extrapolated from
-            one and two iterations.
     """
 
     columns = METHODS
@@ -64,7 +61,7 @@ class Methods(Bench):
     )
     charts = ("error", "ms", "peak_mb")
     title, sections = "Reconstruction methods", ("n", "views")
-    shown = dict.fromkeys((*charts, "iterations_timed", "peer", "over_peer"), ".4g")
+    shown = dict.fromkeys((*charts, "peer", "over_peer"), ".4g")
 
     def __init__(
         self,
@@ -74,10 +71,9 @@ class Methods(Bench):
         rays: int = 2,
         repeats: int = 3,
         once_s: float = 20.0,
-        limit_s: float = 300.0,
     ):
         self.parts, self.plan, self.rays = list(map(Part.of, parts)), expand(base, plan), rays
-        self.repeats, self.once_s, self.limit_s = repeats, once_s, limit_s
+        self.repeats, self.once_s = repeats, once_s
 
     def groups(self) -> list[list[Job]]:
         """Groups of jobs measured together: one case with all methods that support it."""
@@ -93,9 +89,7 @@ class Methods(Bench):
     def label(self, row: Row) -> str:
         return part_label(row)
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """Yield the rows of jobs on one case."""
         case = jobs[0].subject[1]
         with threads(case.threads):
@@ -110,26 +104,11 @@ class Methods(Bench):
                 try:
                     call = _call(job.subject[0], case, data)
                     _call(job.subject[0], case, tiny)()
-                    short = self._short(job.subject[0], case, data)
-                    found = short or self._first(call, data, case)
-                    done[key], calls[key] = row | found, call
+                    done[key], calls[key] = row | self._first(call, data, case), call
                 except Exception as error:  # an error of a part becomes the status of its row
                     yield row | skipped(error)
             say("times")
             yield from self._timed(calls, done, case)
-
-    def _short(self, part: Part, case: Workload, data: MethodInputs) -> Row | None:
-        """Extrapolated time and memory of a method that exceeds the limit; None if it does not."""
-        if (iterations := part.options.get("iterations")) is None:
-            return None
-
-        def run(count: int) -> float:
-            return once(_call(part, case, data, count), case.device)[1]
-
-        timed, memory = with_memory(lambda: shortened(run, iterations, self.limit_s), case.device)
-        if timed is None:
-            return None
-        return {"ms": 1e3 * timed.seconds, "iterations_timed": timed.iterations, "peak_mb": memory}
 
     def _first(self, call: Callable[[], Tensor], data: MethodInputs, case: Workload) -> Row:
         """Error, memory and time of a call; for a short call, of the second one, with filled
@@ -146,8 +125,7 @@ class Methods(Bench):
         self, calls: Mapping[int, Callable[[], Tensor]], done: Mapping[int, Row], case: Workload
     ) -> Iterator[Row]:
         seconds = {key: row["ms"] / 1e3 for key, row in done.items()}
-        whole = [key for key, row in done.items() if "iterations_timed" not in row]
-        short = {key: calls[key] for key in whole if seconds[key] < self.once_s}
+        short = {key: call for key, call in calls.items() if seconds[key] < self.once_s}
         times = interleaved(short, seconds, self.repeats, case.device)
         ms = {key: times[key].ms if key in times else row["ms"] for key, row in done.items()}
         names = {row["part"]: ms[key] for key, row in done.items()}
@@ -157,43 +135,12 @@ class Methods(Bench):
             yield {**row, "ms": ms[key], "calls": count, "over_peer": over, "status": "ok"}
 
 
-def _call(
-    part: Part, case: Workload, data: MethodInputs, iterations: int | None = None
-) -> Callable[[], Tensor]:
+def _call(part: Part, case: Workload, data: MethodInputs) -> Callable[[], Tensor]:
     A, views = data.A.to(case.device), data.views.to(case.device)
-    fewer = {} if iterations is None else {"iterations": iterations}
-    method = build_method({"name": part.name, **part.options, **fewer})
+    method = build_method({"name": part.name, **part.options})
 
     def call() -> Tensor:
         with torch.no_grad():
             return method(views, A).volume
 
     return call
-
-
-class Shortened(NamedTuple):
-    """A run time in seconds, extrapolated from a number of iterations."""
-
-    seconds: float
-    iterations: int
-
-
-def shortened(run: Callable[[int], float], iterations: int, limit_s: float) -> Shortened | None:
-    """Seconds of a number of iterations, extrapolated from one and two iterations; None if they
-    would not exceed the limit and can be run.
-
-    The second iteration costs the same as every later one; the first run also includes the setup.
-    If one iteration already exceeds the limit, all iterations are assumed to cost the same.
-
-    Args:
-        run: seconds of a number of iterations.
-        iterations: number of iterations of the full run.
-        limit_s: maximum seconds of a run.
-    """
-    first = run(1)
-    if first * iterations <= limit_s:
-        return None
-    if first > limit_s:
-        return Shortened(first * iterations, 1)
-    whole = first + (iterations - 1) * max(run(2) - first, 0.0)
-    return Shortened(whole, 2) if whole > limit_s else None

@@ -22,7 +22,7 @@ from mvrecon_bench.rows import Bench, Job, Row, measured, number, skipped
 SHOWN = {
     **{"error_thin": ".4f", "floor_thin": ".4f", "error_pixel": ".4f", "floor_pixel": ".4f"},
     **{f"{call}_ms": ".4g" for call in CALLS},
-    **{"forward_ratio": ".3g", "adjoint_ratio": ".3g", "peak_mb": ".1f", "adjoint_peak_mb": ".1f"},
+    **{"peak_mb": ".1f", "adjoint_peak_mb": ".1f"},
     **{"adjointness": ".1e", "repeatable": "", "nans": ".0f", "pose_cosine": ".3f"},
 }
 CASE = ("scene", "camera", "n", "ratio", "views", "dtype", "threads", "device")
@@ -32,14 +32,12 @@ class Operators(Bench):
     """Every part on every case of a plan; the parts on a case are timed alternately.
 
     Args:
-        parts: the projectors, see `Part.of`; the first one that supports a case is the reference
-            for time ratios.
+        parts: the projectors, see `Part.of`.
         base: first case of the tables, options of `Workload`.
         plan: blocks `{about: {...}, vary: {axis: [values]}, repeat_s: ...}`, see `cases.expand`.
         rays: the pixel average is the mean of rays x rays exact integrals.
-        repeats: minimum number of calls per median time.
-        limit_s: calls that are expected to take longer are skipped. Calls longer than a block's
-            `repeat_s` are timed once, with a note.
+        repeats: minimum number of calls per median time; calls longer than a block's `repeat_s` are
+            timed once, with a note.
     """
 
     columns = OPERATORS
@@ -54,33 +52,26 @@ class Operators(Bench):
         plan: Mapping[str, Mapping[str, Any]],
         rays: int = 4,
         repeats: int = 5,
-        limit_s: float = 30.0,
     ):
         self.parts, self.base = [Part.of(config) for config in parts], Workload(**base)
-        self.rays, self.repeats, self.limit_s = rays, repeats, limit_s
-        self.plan = dict(expand(base, plan))
-
-    def _parts(self, case: Workload) -> list[Part]:
-        """The parts that support a case; the first is the reference for time ratios."""
-        parallel, block = case.cameras().parallel, self.plan[case]["block"]
-        return [part for part in self.parts if part.takes(case.n, parallel, block)]
+        self.rays, self.repeats, self.plan = rays, repeats, dict(expand(base, plan))
 
     def groups(self) -> list[list[Job]]:
         """Groups of jobs measured together: one case with all parts that support it."""
         return [
-            [self.job({**part.row, **asdict(case)}, (part, case)) for part in self._parts(case)]
-            for case in self.plan
+            [
+                self.job({**part.row, **asdict(case)}, (part, case))
+                for part in self.parts
+                if part.takes(case.n, case.cameras().parallel, settings["block"])
+            ]
+            for case, settings in self.plan.items()
         ]
 
     def label(self, row: Row) -> str:
         return part_label(row)
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
-        """Yield the rows of jobs on one case; `rows` are existing rows, used to predict long
-        times.
-        """
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
+        """Yield the rows of jobs on one case."""
         case, shown = jobs[0].subject[1], case_label(jobs[0].row)
         repeat_s = self.plan[case].get("repeat_s", 5.0)
         with threads(case.threads):
@@ -95,7 +86,7 @@ class Operators(Bench):
                 say(f"{shown}: {part.label}")
                 try:
                     trial = Trial(part, grid, rig, x, y)
-                    row |= self._examine(trial, truth, self._forecast(row, rows), repeat_s)
+                    row |= self._examine(trial, truth, repeat_s)
                 except Exception as error:  # an error of a part becomes the status of its row
                     yield row | skipped(error)
                 else:
@@ -103,28 +94,7 @@ class Operators(Bench):
             say(f"{shown}: times")
             yield from self._timed(trials, case, repeat_s)
 
-    def _forecast(self, row: Row, rows: Sequence[Row]) -> dict[str, float]:
-        """Predicted seconds of each call, scaled by work (rays times voxels along an edge) from the
-        largest similar case so far.
-        """
-        same = ("part", "options", "device", "dtype")
-        done = [
-            other
-            for other in rows
-            if other["status"] == "ok"
-            and all(other.get(name, "") == row[name] for name in same)
-            and number(other, "n") < row["n"]
-        ]
-        if not done:
-            return {}
-        nearest = max(done, key=lambda other: other["n"] * other["rays"])
-        grow = row["n"] * row["rays"] / (nearest["n"] * nearest["rays"])
-        times = {call: number(nearest, f"{call}_ms") for call in CALLS}
-        return {call: grow * ms / 1e3 for call, ms in times.items() if ms == ms}
-
-    def _examine(
-        self, trial: Trial, truth: Truth, forecast: Mapping[str, float], repeat_s: float
-    ) -> Row:
+    def _examine(self, trial: Trial, truth: Truth, repeat_s: float) -> Row:
         """Execute every call once, and fast calls again, for errors, memory and repeatability.
 
         Raises:
@@ -132,8 +102,7 @@ class Operators(Bench):
         """
         first: dict[str, Any] = {}
         for call in CALLS:
-            limits = forecast.get(call, 0.0), repeat_s, self.limit_s
-            first[call] = trial.attempt(call, *limits)
+            first[call] = trial.attempt(call, repeat_s)
             if first["forward"] is None:
                 raise RuntimeError("; ".join(trial.notes))
         *calls, pose = first.values()
@@ -166,9 +135,7 @@ class Operators(Bench):
     def _timed(
         self, trials: Sequence[tuple[Trial, Row]], case: Workload, repeat_s: float
     ) -> Iterator[Row]:
-        """Time each call of all parts alternately; return the rows with their ratios to the first
-        part.
-        """
+        """Time each call of all parts alternately; return the rows."""
         for call in CALLS:
             taken = {n: t.seconds[call] for n, (t, _) in enumerate(trials) if call in t.seconds}
             short = {n: seconds for n, seconds in taken.items() if seconds <= repeat_s}
@@ -183,15 +150,8 @@ class Operators(Bench):
                 }
                 if n not in timings:
                     trial.notes.append(f"{call}: one call, which took {seconds:.1f} s")
-        first = self._parts(case)[0]
-        unit = next((row for trial, row in trials if trial.part == first), {})
         for trial, row in trials:
-            for call in CALLS:
-                if {f"{call}_ms"} <= set(row) & set(unit):
-                    row[f"{call}_ratio"] = row[f"{call}_ms"] / unit[f"{call}_ms"]
-            rate = row["rays"] * case.n / (row["forward_ms"] / 1e3)
-            told = {"ray_slabs_per_s": rate, "status": "ok", "note": "; ".join(trial.notes)}
-            yield row | told
+            yield row | {"status": "ok", "note": "; ".join(trial.notes)}
 
     def summary(self, rows: Sequence[Row], folder: Path) -> str:
         """Write `pareto.png`."""

@@ -1,10 +1,12 @@
-"""Plots of benchmarks; the only module that uses matplotlib, without which there are none."""
+"""Plots of benchmarks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
 from typing import Any
+
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 Points = Sequence[tuple[float, float]]
 #: Part -> (ms, error) for increasing volumes, and voxels along an edge -> error floor.
@@ -81,19 +83,17 @@ def _legend(label: str) -> str:
 def _figure(
     panels: Mapping[str, Any], path: Path, draw: Callable[[Any, str, Any], None], title: str = ""
 ) -> None:
-    if not panels or find_spec("matplotlib") is None:
+    if not panels:
         return
-    from matplotlib.figure import Figure
-
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
     # as wide as a page, so that text keeps its size in print
     figure = Figure(figsize=(3.7 * columns, 3.3 * rows), layout="constrained")
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for ax, (title, panel) in zip(axes, panels.items(), strict=False):
+    for ax, (name, panel) in zip(axes, panels.items(), strict=False):
         ax.set(xscale="log", yscale="log")
         ax.grid(True, which="both", linewidth=0.3)
-        draw(ax, title, panel)
+        draw(ax, name, panel)
         for axis in (ax.xaxis, ax.yaxis):
             if axis.get_scale() == "log":
                 _label(axis)
@@ -111,8 +111,6 @@ def _label(axis: Any) -> None:
     """Label the powers of ten of a logarithmic axis, and intermediate ticks if there are few of
     them.
     """
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
-
     low, high = axis.get_view_interval()
     choices = (
         (30, (1,)),

@@ -1,8 +1,8 @@
 """`bench=scaling`: time against the amount of work, with fitted exponents."""
 
 import math
+import statistics
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,13 @@ import torch
 from mvrecon.core.registry import check_choice
 from mvrecon.data.scenes.solids import voxelise
 from mvrecon.geometry.cameras.rigs import circular
+from mvrecon.report.comparison import Cells, markdown
 from mvrecon_bench.benchmarks import plots
 from mvrecon_bench.benchmarks.cases import DTYPES, FIELD, Workload
 from mvrecon_bench.benchmarks.columns import SCALING
 from mvrecon_bench.benchmarks.trial import Part, Trial, part_label
 from mvrecon_bench.measure import interleaved, load_average, threads
-from mvrecon_bench.rows import Bench, Job, Row, markdown, number, skipped
+from mvrecon_bench.rows import Bench, Job, Row, number, skipped
 
 #: Varied quantity -> setting, and the exponent of the setting in the amount of work.
 AXES = {"voxels": ("n", 3), "rays": ("pixels", 2)}
@@ -30,38 +31,15 @@ AXIS_LABELS = {
 CALLS = ("forward", "adjoint")
 
 
-@dataclass(frozen=True)
-class Point:
-    """A part with an amount of work."""
-
-    part: Part
-    axis: str
-    n: int
-    pixels: int
-    views: int
-    batch: int
-    channels: int
-    threads: int
-    device: str
-    dtype: str
-
-    @property
-    def row(self) -> Row:
-        """Its settings, and the amount of work."""
-        setting, power = AXES[self.axis]
-        return {**vars(self), **self.part.row, "size": getattr(self, setting) ** power}
-
-    def trial(self) -> Trial:
-        """Trial of the part on its operands."""
-        case = Workload(n=self.n)
-        detector = {"pixels": [self.pixels] * 2, "pixel_mm": 1.536 * FIELD / self.pixels}
-        rig = circular(self.views, 1000.0, 1536.0, detector, start_degrees=3.0)
-        x = voxelise(case.phantom(), case.grid())
-        x = x.expand(self.batch, self.channels, *x.shape).contiguous()
-        rng = torch.Generator().manual_seed(0)
-        y = torch.randn(self.batch, self.channels, self.views, *rig.shape, generator=rng)
-        x, y = (one.to(self.device, DTYPES[self.dtype]) for one in (x, y))
-        return Trial(self.part, case.grid(), rig, x, y)
+def trial_of(part: Part, work: Mapping[str, Any]) -> Trial:
+    """Trial of a part on an amount of work: n, pixels, views, batch, channels, device, dtype."""
+    case, pixels, volumes = Workload(n=work["n"]), work["pixels"], (work["batch"], work["channels"])
+    detector = {"pixels": [pixels, pixels], "pixel_mm": 1.536 * FIELD / pixels}
+    rig = circular(work["views"], 1000.0, 1536.0, detector, start_degrees=3.0)
+    x = voxelise(case.phantom(), case.grid()).expand(*volumes, *case.grid().shape).contiguous()
+    y = torch.randn(*volumes, len(rig), *rig.shape, generator=torch.Generator().manual_seed(0))
+    x, y = (one.to(work["device"], DTYPES[work["dtype"]]) for one in (x, y))
+    return Trial(part, case.grid(), rig, x, y)
 
 
 class Scaling(Bench):
@@ -104,38 +82,37 @@ class Scaling(Bench):
         """Groups of jobs measured together: one axis."""
         groups = []
         for axis, values in self.vary.items():
-            settings: list[dict[str, Any]] = [self.base | {AXES[axis][0]: n} for n in values]
-            points = [Point(part, axis, **one) for part in self.parts for one in settings]
-            groups.append([self.job(point.row, point) for point in points])
+            setting, power = AXES[axis]
+            works = [{**self.base, setting: n, "axis": axis, "size": n**power} for n in values]
+            pairs = [(part, work) for part in self.parts for work in works]
+            groups.append([self.job({**work, **part.row}, (part, work)) for part, work in pairs])
         return groups
 
     def label(self, row: Row) -> str:
         return f"{part_label(row)}, {row['axis']}"
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """Yield the rows of the points on one axis."""
-        trials: list[tuple[Point, Trial, Row]] = []
+        trials: list[tuple[Trial, Row]] = []
         for job in jobs:
             row = {**job.row, "load": load_average()}
             try:
-                trials.append((job.subject, job.subject.trial(), row))
+                trials.append((trial_of(*job.subject), row))
             except Exception as error:  # an error of a part becomes the status of its row
                 yield row | skipped(error)
         for call in CALLS:
-            say(f"{jobs[0].subject.axis}: {call}")
+            say(f"{jobs[0].row['axis']}: {call}")
             calls, first = {}, {}
-            for key, (point, trial, _) in enumerate(trials):
-                with threads(point.threads):
-                    if trial.attempt(call, 0.0, math.inf, math.inf) is not None:
-                        calls[key] = threads(point.threads)(getattr(trial, call))
+            for key, (trial, row) in enumerate(trials):
+                with threads(row["threads"]):
+                    if trial.attempt(call, math.inf) is not None:
+                        calls[key] = threads(row["threads"])(getattr(trial, call))
                         first[key] = trial.seconds[call]
-            timings = interleaved(calls, first, self.repeats, jobs[0].subject.device)
+            timings = interleaved(calls, first, self.repeats, self.base["device"])
             for key, (ms, count) in timings.items():
-                row = trials[key][2]
+                row = trials[key][1]
                 row |= {f"{call}_ms": ms, "calls": min(row.get("calls", count), count)}
-        for _, trial, row in trials:
+        for trial, row in trials:
             note = "; ".join(trial.notes)
             status = "ok" if "forward_ms" in row else f"skipped: {note}"
             yield {**row, "backend": trial.backend, "status": status, "note": note}
@@ -156,7 +133,7 @@ class Scaling(Bench):
         )
         plots.scaling(panels, folder / "scaling.png", start)
         head = ("part", "axis", "call", "work", "exponent", "standard error")
-        return f"\nTime = c * work^exponent.\n\n{markdown(head, fits, 4)}"
+        return f"\nTime = c * work^exponent.\n\n{markdown(Cells(head, fits), 4)}"
 
 
 def series(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[tuple[float, float]]]:
@@ -175,11 +152,11 @@ def exponent(points: Sequence[tuple[float, float]]) -> tuple[float, float]:
 
     NaN for too few points: p requires two different amounts of work, its error three.
     """
-    x, y = (torch.tensor(values, dtype=torch.float64).log() for values in zip(*points, strict=True))
-    x, y = x - x.mean(), y - y.mean()
-    spread = x.square().sum()
-    if not spread > 0:
+    work, ms = ([math.log(value) for value in values] for values in zip(*points, strict=True))
+    if len(set(work)) < 2:
         return math.nan, math.nan
-    p = (x * y).sum() / spread
-    left = (y - p * x).square().sum() / max(len(points) - 2, 1)
-    return p.item(), (left / spread).sqrt().item() if len(points) > 2 else math.nan
+    p, start = statistics.linear_regression(work, ms)
+    if len(points) < 3:
+        return p, math.nan
+    left = sum((y - start - p * x) ** 2 for x, y in zip(work, ms, strict=True))
+    return p, math.sqrt(left / (len(points) - 2) / (len(points) - 1) / statistics.variance(work))

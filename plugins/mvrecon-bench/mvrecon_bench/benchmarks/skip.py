@@ -232,9 +232,7 @@ class Skip(Bench):
     def label(self, row: Row) -> str:
         return " ".join(row[name] for name in ("scene", "rig", "method", "task", "mode"))
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """Rows of some modes of a task; all of its modes are timed, since only alternate timings
         are comparable.
         """

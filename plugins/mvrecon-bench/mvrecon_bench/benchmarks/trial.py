@@ -19,8 +19,6 @@ from mvrecon_bench.rows import Row, reason
 
 #: The calls in order of execution.
 CALLS = ("forward", "adjoint", "volume_grad", "pose_grad")
-#: The calls that a call consists of, for the time expected of it.
-MADE_OF = {"volume_grad": ("forward", "adjoint"), "pose_grad": ("forward",) * 3}
 
 
 @dataclass(frozen=True)
@@ -160,19 +158,12 @@ class Trial:
         pairs = zip(slopes, leaves, strict=True)
         return [torch.zeros_like(leaf) if slope is None else slope for slope, leaf in pairs]
 
-    def attempt(self, call: str, forecast_s: float, repeat_s: float, limit_s: float) -> Any:
+    def attempt(self, call: str, repeat_s: float) -> Any:
         """The result of a call, with its time in `seconds`; None, with a note, if it fails.
 
         A call that takes longer than `repeat_s`, for example to compile, is repeated once, and the
-        second call counts; a call that is expected to exceed `limit_s`, by a forecast or by the
-        calls it consists of, is skipped.
+        second call counts.
         """
-        pieces = sum(self.seconds.get(piece, 0.0) for piece in MADE_OF.get(call, ()))
-        if (expected := max(forecast_s, pieces)) > limit_s:
-            self.notes.append(
-                f"{call} left out: about {expected:.0f} s expected, limit {limit_s:g} s"
-            )
-            return None
         try:
             result, seconds = once(getattr(self, call), self.device)
             self.first_s.setdefault(call, seconds)

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from mvrecon.data.scenes.solids import Phantom, voxelise
 from mvrecon.geometry.cameras.camera import Cameras
@@ -51,20 +50,12 @@ def truth_of(case: Workload, rays: int) -> Truth:
     """
     grid, rig, phantom = case.grid(), case.cameras(), case.phantom()
     volume = voxelise(phantom, grid)
-    thin = phantom.integrals(*rig.rays(), ray_extent=rig.ray_extent)
-    pixel = pixel_mean(phantom, rig, rays)
+    thin, pixel = phantom.views(rig), phantom.views(rig, rays)
     watched = torch.linspace(0, len(rig) - 1, min(WATCHED, len(rig))).long()
     cotangent = torch.randn(thin.shape, generator=torch.Generator().manual_seed(0))
     pose = pose_gradient(phantom, rig[watched], cotangent[watched].double(), grid)
     exact = RayTransform(grid, rig, method="siddon")(volume.double()[None, None])[0, 0]
     return Truth(volume, cotangent, thin, pixel, gap(exact, thin), gap(exact, pixel), watched, pose)
-
-
-def pixel_mean(phantom: Phantom, cameras: Cameras, rays: int) -> Float[Tensor, "m v u"]:
-    """Mean of exact integrals over rays x rays evenly distributed rays per pixel, in float64."""
-    fine = cameras.refined(rays)
-    views = (phantom.integrals(*one.rays(), ray_extent=one.ray_extent) for one in fine)
-    return torch.cat([avg_pool2d(view, rays) for view in views])
 
 
 def pose_gradient(
@@ -79,8 +70,7 @@ def pose_gradient(
     step, columns = STEP * min(grid.spacing), []
     for k in range(6):
         ahead, behind = (
-            pixel_mean(phantom, moved(cameras, k, amount, grid), POSE_RAYS)
-            for amount in (step, -step)
+            phantom.views(moved(cameras, k, amount, grid), POSE_RAYS) for amount in (step, -step)
         )
         columns.append((weights * (ahead - behind)).sum(dim=(1, 2)) / (2 * step))
     return torch.stack(columns, dim=1)

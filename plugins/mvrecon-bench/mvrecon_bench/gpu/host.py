@@ -1,10 +1,9 @@
 """Python overhead of a projection, its adjoint and its pose gradient: microseconds of processor
 time with an empty driver. Requires no GPU.
 
-    python -m mvrecon_bench.gpu.host [--calls 200] [--rounds 40]
+    python -m mvrecon_bench.gpu.host
 """
 
-import argparse
 import ctypes
 import time
 from collections.abc import Callable
@@ -20,6 +19,8 @@ from mvrecon.kernels.cuda.launch import RAYS
 from mvrecon.kernels.rays.cuda import operators
 from mvrecon.kernels.rays.lines import lines_of
 from mvrecon_bench.measure import once
+
+CALLS, ROUNDS = 200, 40
 
 
 def without_a_device() -> None:
@@ -46,27 +47,23 @@ def calls() -> dict[str, Callable[[], Any]]:
     }
 
 
-def microseconds(call: Callable[[], Any], count: int, rounds: int) -> float:
+def microseconds(call: Callable[[], Any]) -> float:
     """Microseconds per call; minimum over several rounds, after a warm-up."""
 
     def repeated() -> None:
-        for _ in range(count):
+        for _ in range(CALLS):
             call()
 
-    times = [once(repeated, "cpu", time.process_time)[1] for _ in range(rounds + 1)]
-    return 1e6 * min(times[1:]) / count
+    times = [once(repeated, "cpu", time.process_time)[1] for _ in range(ROUNDS + 1)]
+    return 1e6 * min(times[1:]) / CALLS
 
 
 def main() -> None:
     """Entry point."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--calls", type=int, default=200)
-    parser.add_argument("--rounds", type=int, default=40)
-    options = parser.parse_args()
     torch.set_num_threads(1)
     without_a_device()
     for what, call in calls().items():
-        print(f"{what}: {microseconds(call, options.calls, options.rounds):.1f} us", flush=True)
+        print(f"{what}: {microseconds(call):.1f} us", flush=True)
 
 
 if __name__ == "__main__":

@@ -27,11 +27,10 @@ from mvrecon_bench.measure import once
 #: Size in mm of the volume along (x, y, z) and of the detector along (v, u).
 FIELD, DETECTOR = (512, 320, 384), (864, 960)
 #: `train` and `test` are files of scripts/data/prepare_openkbp.py; `profile` steps run under the
-#: profiler, in `precision` bf16 or fp32.
+#: profiler.
 OPTIONS: dict[str, Any] = {
     **{"train": "", "test": "", "method": "cross_view", "n": 64, "steps": 20, "profile": 8},
-    **{"cases": 96, "val": 4, "tests": 33, "batch": 2, "views": 8, "lr": 3e-3},
-    **{"precision": "bf16", "compile": False},
+    **{"cases": 96, "val": 4, "tests": 33, "batch": 2, "views": 8},
 }
 
 
@@ -64,14 +63,11 @@ def settings_of(options: Namespace, name: str) -> TrainSettings:
 
 
 def training_step(
-    module: ReconstructionModule,
-    batch_of: Callable[[int], Batch],
-    lr: float,
-    half: bool,
+    module: ReconstructionModule, batch_of: Callable[[int], Batch], half: bool = True
 ) -> Callable[[int], Tensor]:
     """A step of AdamW on the batch of a number, in bfloat16 if `half`: the loss."""
     weights = [p for p in module.parameters() if p.requires_grad and p.numel()]
-    optimizer, device = OPTIMIZERS.build("adamw", weights, lr=lr), weights[0].device.type
+    optimizer, device = OPTIMIZERS.build("adamw", weights, lr=1e-3), weights[0].device.type
 
     def step(number: int) -> Tensor:
         with torch.autocast(device, torch.bfloat16, enabled=half):
@@ -143,7 +139,7 @@ def main() -> None:
     """Entry point."""
     options = options_of(__doc__, settings=True, **OPTIONS)
     device = on_device(options.device)
-    name = f"{options.method}_{options.n}_{options.precision}" + "_compiled" * options.compile
+    name = f"{options.method}_{options.n}_bf16"
     results = Results(options.out, f"learn_{name}")
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = True
     torch.backends.cudnn.benchmark = True
@@ -153,8 +149,6 @@ def main() -> None:
     torch.manual_seed(0)
     module = build_module(settings, settings.method, data.data_range).to(device)
     results.add("parameters", sum(p.numel() for p in module.parameters()))
-    if options.compile:
-        module.method.compile()
     prepared = data.sets["train"].prepare()
     cases = [prepared[key].to(device) for key in ("views", "volume", "inside")]
 
@@ -164,7 +158,7 @@ def main() -> None:
         views, volume, inside = (values[chosen] for values in cases)
         return {"views": views, "volume": volume, "inside": inside}
 
-    step = training_step(module, batch_of, options.lr, options.precision == "bf16")
+    step = training_step(module, batch_of)
     if options.profile:
         results.attempt("profile", profiled, step, options.profile, device)
     results.attempt("training", timed, step, options.steps, device, results)

@@ -57,7 +57,7 @@ def steps(
     torch.manual_seed(0)
     module = build_module(settings, settings.method, data_range).to(device)
     there = move_data_to_device(batch, device)
-    return profiled(training_step(module, lambda number: there, 1e-3, False), count, device)
+    return profiled(training_step(module, lambda number: there, half=False), count, device)
 
 
 def main() -> None:

@@ -91,17 +91,12 @@ def case(
     return described
 
 
-def refused(
-    acts: Mapping[str, Callable[[], object]],
-    saying: str | Callable[[str], str] = "",
-    kinds: type[Exception] | tuple[type[Exception], ...] = ValueError,
-) -> float:
-    """Return 0 if every act raises the expected error.
+def refused(acts: Mapping[str, Callable[[], object]], saying: str | Callable[[str], str]) -> float:
+    """Return 0 if every act raises a ValueError.
 
     Args:
         acts: the calls that must fail, by name.
         saying: regular expression that the message must contain, or a function of the name.
-        kinds: permitted types of errors.
 
     Raises:
         AssertionError: some acts do not fail so; the message begins with their number.
@@ -112,7 +107,7 @@ def refused(
         try:
             act()
             faults[name] = "raises no error"
-        except kinds as error:
+        except ValueError as error:
             text = f"{error}{error.__cause__ or ''}"
             if not re.search(words, text, re.DOTALL):
                 faults[name] = f"raises {text[:160]!r}, expected {words!r}"

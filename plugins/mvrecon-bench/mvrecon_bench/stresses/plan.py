@@ -1,18 +1,17 @@
 """The stress plan: every case with every applicable part, run row by row as a benchmark."""
 
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mvrecon.core.files.atomic import write_text
 from mvrecon.core.parts import REGISTRIES, required
 from mvrecon.core.registry import hint
 from mvrecon.operators.ray_transform import RAY_METHODS
+from mvrecon.report.comparison import Cells, markdown
 from mvrecon_bench.benchmarks.cases import DTYPES
-from mvrecon_bench.rows import Bench, Job, Row, figure, markdown
+from mvrecon_bench.rows import Bench, Job, Row, figure
 from mvrecon_bench.stresses.case import KINDS, Case
 from mvrecon_bench.stresses.subject import Subject
 from mvrecon_bench.stresses.subjects import subject_of
@@ -133,9 +132,7 @@ class Stress(Bench):
     def label(self, row: Row) -> str:
         return f"{row['number']:.0f} {row['part']} {row['dtype']}"
 
-    def measure(
-        self, jobs: Sequence[Job], rows: Sequence[Row], say: Callable[[str], None]
-    ) -> Iterator[Row]:
+    def measure(self, jobs: Sequence[Job], say: Callable[[str], None]) -> Iterator[Row]:
         """Yield a verdict for each job."""
         for job in jobs:
             case, subject = job.subject
@@ -143,16 +140,17 @@ class Stress(Bench):
             yield judge(case, subject, self.limit_s)
 
     def summary(self, rows: Sequence[Row], folder: Path) -> str:
-        """Write all rows as JSON; the verdicts on each part, and the failures."""
-        write_text(folder / "verdicts.json", json.dumps(list(rows), indent=1) + "\n")
+        """The verdicts on each part, and the failures."""
         groups: dict[tuple[str, ...], list[Row]] = {}
         for row in rows:
             groups.setdefault(tuple(row[name] for name in self.sections), []).append(row)
         lines = [(*key, *map(str, counts(members).values())) for key, members in groups.items()]
-        text = f"\n{markdown((*self.sections, *counts(rows)), lines, 3)}"
+        text = f"\n{markdown(Cells((*self.sections, *counts(rows)), lines), 3)}"
         failed = [row for row in rows if row["verdict"] == FAIL]
         cells = [[self.label(row), *(figure(row, *one) for one in SHOWN.items())] for row in failed]
-        return text + (f"\n## Failed\n\n{markdown(('', *SHOWN), cells, 8)}" if failed else "")
+        return text + (
+            f"\n## Failed\n\n{markdown(Cells(('', *SHOWN), cells), 7)}" if failed else ""
+        )
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:

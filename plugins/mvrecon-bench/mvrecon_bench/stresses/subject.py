@@ -249,10 +249,3 @@ def rig_about(
 
 def _radius(grid: Grid) -> float:
     return float((grid.corners() - grid.centre).norm(dim=-1).max())
-
-
-def cropped(rig: Cameras, row: int, column: int, shape: tuple[int, int]) -> Cameras:
-    """A part of the detectors that begins at a row and a column."""
-    shift = row * rig.v + column * rig.u
-    source = rig.source + shift if rig.parallel else rig.source
-    return replace(rig, source=source, origin=rig.origin + shift, shape=shape)

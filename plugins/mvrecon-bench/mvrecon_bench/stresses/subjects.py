@@ -142,10 +142,10 @@ class SceneSubject(Subject):
             raise DoesNotApply("it has one case")
 
 
-def small_rig(n_views: int = 3) -> Cameras:
+def small_rig() -> Cameras:
     """Cone beams whose outer rays miss the grid; detector sizes are multiples of 3."""
     detector = {"pixels": [12, 15], "pixel_mm": [5.0, 4.5]}
-    return circular(n_views, 60.0, 120.0, detector, start_degrees=13.0)
+    return circular(3, 60.0, 120.0, detector, start_degrees=13.0)
 
 
 class HeadSubject(Subject):

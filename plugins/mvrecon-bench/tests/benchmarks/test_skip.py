@@ -6,8 +6,6 @@ from mvrecon_bench.bench import BENCHES
 from mvrecon_bench.benchmarks import plots
 from mvrecon_bench.benchmarks.skip import TASKS
 
-pytest.importorskip("matplotlib")
-
 N = 12
 SMALL = (
     "bench=skip",

@@ -16,7 +16,7 @@ from mvrecon.geometry.grid import Box, Grid, three
 from mvrecon.testing.measures import gap, greatest
 from mvrecon_bench.stresses.analytic import DIRECTIONS, box_lengths, ends, rows, ways
 from mvrecon_bench.stresses.case import EXACT, case, refused
-from mvrecon_bench.stresses.subject import ProjectorSubject, Subject, cropped
+from mvrecon_bench.stresses.subject import ProjectorSubject, Subject
 
 AXES = torch.eye(3, dtype=torch.float64)
 #: Deviation of a ray from its axis relative to its length; the last two are subnormal.
@@ -222,9 +222,10 @@ def tiled(subject: ProjectorSubject) -> Iterator[float]:
     for tile in (1, 7, 64):
         parts = torch.zeros_like(whole)
         for row, column in itertools.product(range(0, 5, tile), range(0, 9, tile)):
-            shape = min(tile, 5 - row), min(tile, 9 - column)
-            part = subject.projector(CUBE, cropped(rig, row, column, shape))(volume)
-            parts[..., row : row + shape[0], column : column + shape[1]] = part
+            ends = min(row + tile, 5), min(column + tile, 9)
+            part = rig.cropped((row, ends[0]), (column, ends[1]))
+            views = subject.projector(CUBE, part)(volume)
+            parts[..., row : ends[0], column : ends[1]] = views
         yield gap(parts, whole)
 
 

@@ -163,12 +163,7 @@ def smooth(subject: ProjectorSubject) -> float:
 @case("projector", 31)
 def sharp(subject: ProjectorSubject) -> float:
     """Solids with edges on three grids: error falls by the stated order."""
-    solids = _solids()
-    return 0.9 - _order(
-        subject,
-        lambda grid: _voxels(grid.shape[0]),
-        lambda rig: solids.integrals(*rig.rays(), ray_extent=rig.ray_extent),
-    )
+    return 0.9 - _order(subject, lambda grid: _voxels(grid.shape[0]), _solids().views)
 
 
 @case("projector", 32, 1e-3)

@@ -19,13 +19,7 @@ from mvrecon.kernels.rays.occupancy import Occupancy
 from mvrecon.operators.selection import RaySelection, ViewSelection
 from mvrecon.testing.measures import bits, gap, greatest
 from mvrecon_bench.stresses.case import DOUBLE, EXACT, SINGLE, DoesNotApply, case
-from mvrecon_bench.stresses.subject import (
-    GRID,
-    ProjectorSubject,
-    Subject,
-    cropped,
-    rig_about,
-)
+from mvrecon_bench.stresses.subject import GRID, ProjectorSubject, Subject, rig_about
 
 #: More pixels than 32-bit indices support, and a subset of them.
 LONG, FEW = 46400, 8
@@ -82,7 +76,7 @@ def large_detector(subject: ProjectorSubject) -> float:
     detector = {"pixels": [200, 190], "pixel_mm": 0.09, "offset_mm": [0.04, -0.03]}
     A, x, _ = subject.pair(detector=detector, n_views=1)
     rig = subject.rig(detector=detector, n_views=1)
-    bands = [cropped(rig, row, 0, (min(63, 200 - row), 190)) for row in range(0, 200, 63)]
+    bands = [rig.cropped((row, min(row + 63, 200)), (0, 190)) for row in range(0, 200, 63)]
     return gap(torch.cat([subject.projector(GRID, band)(x) for band in bands], dim=3), A(x))
 
 
@@ -206,7 +200,7 @@ def _long() -> dict:
 
 
 def _last_pixels(subject: ProjectorSubject, rig: Cameras) -> float:
-    few = cropped(rig, LONG - FEW, LONG - FEW, (FEW, FEW))
+    few = rig.cropped((LONG - FEW, LONG), (LONG - FEW, LONG))
     A, B = (subject.projector(GRID, cameras) for cameras in (rig, few))
     x = subject.random(1, 1, *GRID.shape)
     try:
