@@ -78,11 +78,7 @@ def sanity_checks(
     words: list[str] = []
     limit, view_nrmse = MAX_VIEW_NRMSE, outcome.view_nrmse
     kind = getattr(METHODS.get(method.name), "data_kind", "integrals")
-    if outcome.lost:
-        words.append(
-            f"lost views, zero everywhere: {', '.join(map(str, outcome.lost))} (from 0); "
-            f"correct=align replaces them by the volume's"
-        )
+    lost = _of_lost_views(scan, outcome.lost)
     seen = SomeViews.of(scan, coarse_grid(scan), device) if _sees_integrals(scan) else None
     if seen:
         counts = _of_counts(seen.first) if kind == "integrals" else []
@@ -110,6 +106,8 @@ def sanity_checks(
             )
         elif noise is not None:
             words += _of_hot_voxels(outcome.volume)
+    # a right volume leaves its views of the lost ones
+    limit = math.hypot(limit, math.sqrt(len(outcome.lost) / len(scan.cameras)))
     beside = _beside(seen) if seen and view_nrmse > limit else 0.0
     # filtered back-projection is right on a grid of a part of the object, which explains no views
     part = beside > MIN_BESIDE and METHODS.get(method.name) in (fbp, fdk)
@@ -123,7 +121,7 @@ def sanity_checks(
                 "large enough, and a network was trained for such views"
             )
         )
-    return words
+    return lost + words
 
 
 def _sees_integrals(scan: Scan) -> bool:
@@ -205,6 +203,20 @@ def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
     return [
         f"expected line integrals, got whole numbers up to {view.max().item():g}; grey values want "
         f"views.kind=intensities and views.flat, counts of emission osem"
+    ]
+
+
+def _of_lost_views(scan: Scan, numbers: list[int]) -> list[str]:
+    """Check for views that are zero everywhere, as columns of a sinogram beside the object are."""
+    if not numbers:
+        return []
+    measured, last = scan.measured, len(scan.cameras) - 1
+    sinogram = isinstance(measured, MeasuredViews) and measured.options.layout == "sinogram"
+    exchanged = sinogram and numbers[0] == 0 and numbers[-1] == last
+    return [
+        f"lost views, zero everywhere: {', '.join(map(str, numbers))} (from 0); "
+        + ("are the sinogram's angles its columns? Expected its rows; else " * exchanged)
+        + "correct=align replaces them by the volume's"
     ]
 
 

@@ -374,6 +374,11 @@ def test_lengths_in_metres_and_lost_views_are_detected(views, right_rig):
     assert checked(scan_of(views), "fdk", 0.05, 300 * WATER) == []
     (words,) = checked(scan_of(views), "fdk", 0.05, lost=[3, 7])
     assert "lost views, zero everywhere: 3, 7" in words and "correct=align" in words
+    both = checked(scan_of(views), "fdk", 0.05, 1000 * WATER, lost=[3, 7])
+    assert "lost views" in both[0] and "in metres?" in both[1] and len(both) == 2
+    assert len(checked(scan_of(views), "fdk", 0.3, lost=[3, 7])) == 1  # which zeros alone leave
+    both = checked(scan_of(views), "fdk", 0.8, lost=[3, 7])
+    assert "lost views" in both[0] and "does not reproduce the views" in both[1]
 
 
 def head(rig, offset):

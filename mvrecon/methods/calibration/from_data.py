@@ -33,7 +33,7 @@ from mvrecon.geometry.cameras.field import isocentre, resolution
 from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.methods.calibration.alignment import Blur, RootRamp, blurred, least_deviations
 from mvrecon.methods.classical.least_squares import cgls
-from mvrecon.methods.classical.truncation import cut_sides
+from mvrecon.methods.classical.truncation import cut_sides, truncated_slices
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled, Symmetric, check_finite
 
 
@@ -236,7 +236,7 @@ MAX_FINAL_CHANGE = 2e-3
 #: The views determine a parameter if the ratio of unexplained to explained effect exceeds that of
 #: the views so many times.
 MIN_DETERMINED_RATIO = 10.0
-#: The same of truncated views, of the effect alone: 0.17 of an offset over a half turn of parallel
+#: The same of truncated slices, of the effect alone: 0.17 of an offset over a half turn of parallel
 #: beams, which is found 1.2 pixels off, 0.33 and more of one that is found.
 MIN_UNEXPLAINED_TRUNCATED = 0.25
 #: Uncertainty of a parameter, relative to the change that has as much effect as all that stays
@@ -299,8 +299,12 @@ class _Fit(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """Filtered views, the operator on volumes of blobs, the rig's parameters, and the filter of the
-    volume's views; None: those of complete views need none.
+    """Filtered views, the operator on volumes of blobs, and the rig's parameters.
+
+    Args:
+        filter: filter of the volume's views; None: those of complete views need none.
+        least: part of a parameter's effect, relative to the explained one, that must stay
+            unexplained for the views to determine it.
     """
 
     operator_of: OperatorOf
@@ -309,6 +313,7 @@ class Problem(NamedTuple):
     blobs: Blur
     views: Float[Tensor, "1 1 m v u"]
     filter: Callable[[tuple[int, ...]], LinearOperator] | None
+    least: float = 0.0
 
     def rig(self, values: Float[Tensor, "m k"]) -> Cameras:
         return misaligned(self.cameras, self.unknowns.misalignment(values))
@@ -426,7 +431,10 @@ def calibrated(
         return Blur(shape, (0.0, blur_px, 0.0), A.device) @ ramp
 
     smooth = of_rows(views.shape[2:])(views) if cut else blurred(views, blur_px)
-    problem = Problem(operator_of, cameras[seen], numbers, blobs, smooth, of_rows if cut else None)
+    truncated = truncated_slices(views, cameras[seen]).any()
+    least = MIN_UNEXPLAINED_TRUNCATED if truncated else 0.0
+    filter = of_rows if cut else None
+    problem = Problem(operator_of, cameras[seen], numbers, blobs, smooth, filter, least)
     while True:
         fit = _fitted(problem, start, iterations, rounds, monitor)
         uncertainty = _uncertainties(problem, fit, iterations)
@@ -517,9 +525,7 @@ def _uncertainties(problem: Problem, fit: _Fit, iterations: int) -> dict[str, fl
     """
     A, r = problem.operator(fit.values), problem.residual(fit.values, fit.x)
     columns = derivatives(lambda moved: problem.operator(moved)(fit.x), fit.values)
-    least, result = MIN_DETERMINED_RATIO * _unexplained(r, problem.views), {}
-    if problem.filter is not None:
-        least = max(least, MIN_UNEXPLAINED_TRUNCATED)
+    least, result = max(problem.least, MIN_DETERMINED_RATIO * _unexplained(r, problem.views)), {}
     numbers, rng = problem.unknowns, torch.Generator().manual_seed(0)
     signs = (torch.randint(2, (len(columns[0]), 1, 1), generator=rng) * 2 - 1).to(columns)
     for kind, column, basis in zip(numbers.kinds, columns, numbers.basis.unbind(1), strict=True):

@@ -32,7 +32,12 @@ from mvrecon.methods.calibration.alignment import (
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
 from mvrecon.methods.classical.solver import check_no_gradient
-from mvrecon.methods.classical.truncation import CUT_EDGE, MAX_AIR, MAX_AIR_SHARE, cut_sides
+from mvrecon.methods.classical.truncation import (
+    CUT_EDGE,
+    MAX_AIR,
+    MAX_AIR_SHARE,
+    truncated_slices,
+)
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.memo import grid_key, kept, place
@@ -177,7 +182,7 @@ def _best(A: Projector, measured: Float[Tensor, "b 1 m v u"], by: Alignment) -> 
     halves = [view_subset(A, range(first, measured.shape[2], 2)) for first in (0, 1)]
     best = (measured, torch.zeros_like(by.shift_px), shifted.gain)
     least = _prediction_error(halves, measured, *best)
-    cut = cut_sides(measured).flatten(1).any(dim=1)
+    cut = truncated_slices(measured, A.cameras)
     # a GPU would have to be waited for
     unaligned = cut if measured.is_cuda else cut | (share_beside(A, measured) > MAX_BESIDE)
     for tried, most in zip((shifted, by), MAX_CUT_RATIOS, strict=True):

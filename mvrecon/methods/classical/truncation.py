@@ -17,6 +17,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from mvrecon.core.numbers import SIGMA_PER_MEDIAN, divided, second_differences
+from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.rigid import unit
 
 #: Share of a row at its end to which the ellipse is fitted, with the least number of columns, and
 #: the share whose mean is the value at the edge.
@@ -34,7 +36,10 @@ MAX_LEVEL = 3.0
 #: Edges of all views, relative to their greatest values, from which on they end inside the object:
 #: a bottle's holder, or a flat field that is not air's, has less.
 CUT_EDGE = 0.05
-#: The same of a single view, which has more noise, and whose rows are continued. Below it a
+#: Cosine of a detector's columns with its rows and beams, up to which rows of parallel beams see a
+#: slice each: 3 degrees, of which a calibrated tilt has less.
+MAX_SLICE_COSINE = 0.05
+#: The edge of a single view, which has more noise, from which on its rows are continued. Below it a
 #: cylinder reads 0.2 % high at most (study 30).
 CONTINUED_EDGE = 0.1
 #: Standard deviations of noise beyond which an edge shows an object, and the share of the views
@@ -110,6 +115,20 @@ def edge_shares(ends: Float[Tensor, "b c m 2 10 i"]) -> Float[Tensor, "b 2 2"]:
 def cut_sides(views: Float[Tensor, "b c m v u"]) -> Bool[Tensor, "b 2 2"]:
     """Whether views end inside the object, by `edge_shares`."""
     return edge_shares(ends_of(views)) > CUT_EDGE
+
+
+def truncated_slices(views: Float[Tensor, "b c m v u"], cameras: Cameras) -> Bool[Tensor, " b"]:
+    """Whether rays pass through parts of the object that other views do not show: views end inside
+    it, at any side, or at the ends of rows that see a slice each, as those of parallel beams across
+    their axis, which no ray leaves.
+    """
+    cut = cut_sides(views).any(dim=2)
+    rows = cut[:, 0]
+    if cameras.parallel:
+        steps = torch.stack([cameras.u, cameras.origin - cameras.source])
+        slices = ((unit(steps) @ unit(cameras.v[0])).abs() < MAX_SLICE_COSINE).all()
+        rows = rows & ~slices.to(rows.device)  # without waiting for a GPU
+    return rows | cut[:, 1]
 
 
 def reach_rows(edges: Float[Tensor, "b c m 10 i"]) -> bool:

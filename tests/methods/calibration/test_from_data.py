@@ -288,6 +288,27 @@ def test_the_axis_of_parallel_beams_comes_back(rows, arc, offset):
     assert (estimate.misalignment.offset_px[:, 0] - offset).abs().max() < 0.1
 
 
+def test_the_axis_of_an_object_higher_than_the_rows_of_parallel_beams_comes_back():
+    """No ray leaves its slice, so that half a turn tells the axis as that of a complete object; on
+    a grid half again as wide, as views that end inside the object have. Also tried: intensities of
+    120 views over 128 columns, offsets of -7 and 3.3 pixels, ellipsoids that end at one row or at
+    both, a tilt of 0.8 degrees beside the offset.
+    """
+    rig = parallel(60, {"pixels": [3, 64], "pixel_mm": 2.0})
+    centres = torch.tensor([[4.0, -3, 2], [12, 6, 6], [-14, -6, -8], [-6, 10, -4]])
+    sizes = torch.tensor([[34.0, 26, 400], [8, 5, 300], [6, 6, 500], [3, 3, 300]])
+    values, turn = torch.tensor([0.02, 0.015, -0.01, 0.03]), torch.eye(3).expand(4, 3, 3)
+    fine = rig.shifted(torch.tensor([[-3.5, 0.0]])).refined(2)
+    body = Phantom((Solids("ellipsoid", centres, turn, sizes, values),))
+    views = torch.nn.functional.avg_pool2d(body.integrals(*fine.rays()).float(), 2)
+    counts = torch.poisson(2e4 * (-views).exp(), torch.Generator().manual_seed(0))
+    views = -(counts / 2e4).log()[None, None]
+    grid = Grid.centred(size=(64, 64, 3), spacing=[3.0, 3.0, 2.0])
+    estimate = calibrated(partial(Radon, grid), rig, views, ["offset_u"])
+    assert estimate.kept == []
+    assert abs(estimate.misalignment.offset_px[0, 0] + 3.5) < 0.1
+
+
 def test_misaligned_parallel_rays_keep_their_direction_and_follow_the_pixels():
     """A shift is that of `Cameras.shifted`, also of rays oblique to the detector; a tilt about the
     beam turns the pixels in their plane; there is no source to shift.

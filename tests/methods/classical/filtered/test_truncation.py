@@ -4,6 +4,7 @@ arcs too short."""
 import math
 import re
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,15 +12,17 @@ import torch
 from mvrecon.core.numbers import uniform
 from mvrecon.data.scenes.solids import Phantom, Solids
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.geometry.cameras.rigs import circular, parallel
 from mvrecon.geometry.grid import Grid, voxel_centres
-from mvrecon.geometry.rigid import euler_rotation
+from mvrecon.geometry.rigid import euler_rotation, unit
 from mvrecon.methods.classical.fdk import fbp, fdk, pixel_weights
 from mvrecon.methods.classical.redundancy import redundancy_weights
 from mvrecon.methods.classical.truncation import (
     continuation,
     cut_sides,
     edges_of,
+    truncated_slices,
     warn_of_truncation,
 )
 from mvrecon.operators.drr import Drr
@@ -312,6 +315,36 @@ def test_sides_at_which_views_end_inside_the_object_are_those_it_extends_beyond(
         rng = torch.Generator().manual_seed(0)
         views = views + noise * views.max() * torch.randn(views.shape, generator=rng)
         assert cut_sides(views).tolist() == [cut], (rows, columns, up, aside)
+
+
+@pytest.mark.parametrize(
+    ("beam", "rows", "columns", "tilt", "roll", "truncated"),
+    [
+        ("parallel", 40, 200, 0.0, 0.0, False),
+        ("parallel", 40, 200, 1.0, 1.0, False),
+        ("parallel", 40, 200, 30.0, 0.0, True),
+        ("parallel", 40, 200, 0.0, 10.0, True),
+        ("parallel", 200, 40, 0.0, 0.0, True),
+        ("cone", 40, 200, 0.0, 0.0, True),
+        ("cone", 200, 200, 0.0, 0.0, False),
+    ],
+)
+def test_rows_of_parallel_beams_do_not_truncate_the_slices_that_they_see(
+    beam, rows, columns, tilt, roll, truncated
+):
+    """A ball higher or wider than the panel. Beams that are tilted against the rows, as in
+    laminography, and rolled rows cross slices.
+    """
+    panel = {"pixels": [rows, columns], "pixel_mm": 1.5}
+    rig = circular(12, 400.0, 600.0, panel) if beam == "cone" else parallel(12, panel)
+    by = Misalignment.none(12)
+    by.tilt_degrees[:, 2] = roll
+    rig = misaligned(rig, by)
+    rise = (rig.origin - rig.source).norm(dim=1) * math.tan(math.radians(tilt)) / 2
+    up = rise[:, None] * unit(rig.v)  # the axis is half way between source and detector
+    rig = replace(rig, source=rig.source - up, origin=rig.origin + up) if tilt else rig
+    views = views_of(ellipsoids("on one side"), rig)
+    assert truncated_slices(views, rig).tolist() == [truncated]
 
 
 def test_metal_does_not_hide_that_views_end_inside_the_object():
