@@ -213,10 +213,10 @@ def _of_lost_views(scan: Scan, numbers: list[int]) -> list[str]:
     measured, last = scan.measured, len(scan.cameras) - 1
     sinogram = isinstance(measured, MeasuredViews) and measured.options.layout == "sinogram"
     exchanged = sinogram and numbers[0] == 0 and numbers[-1] == last
+    ask = "are the sinogram's angles its columns? Expected its rows; else " if exchanged else ""
     return [
-        f"lost views, zero everywhere: {', '.join(map(str, numbers))} (from 0); "
-        + ("are the sinogram's angles its columns? Expected its rows; else " * exchanged)
-        + "correct=align replaces them by the volume's"
+        f"lost views, zero everywhere: {', '.join(map(str, numbers))} (from 0); {ask}correct=align "
+        f"replaces them by the volume's"
     ]
 
 
