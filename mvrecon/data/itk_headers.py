@@ -234,7 +234,8 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
         line, end, _ = text[place:].partition("\n")
         place += len(line) + len(end)
         found = _pair(line)
-        if not end or not (found or not line.strip()):
+        last = found is not None and found[0] == "ElementDataFile"  # may end with the file
+        if not (end or last) or not (found or not line.strip()):
             raise checks.Refused(
                 f"{path}: expected a MetaImage header of lines such as 'DimSize = 4 3 2' with "
                 f"ElementDataFile last, got {checks.shown(line)}"

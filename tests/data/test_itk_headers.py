@@ -320,6 +320,24 @@ def test_long_lines_are_read_without_a_wait(place, line, tmp_path):
     assert all(len(str(one.message)) < 2000 for one in found)
 
 
+@pytest.mark.parametrize("end", ["", " ", "\r", "\r\n", "\n\n"])
+def test_a_header_may_end_behind_its_last_key(end, tmp_path):
+    """As in files written by hand, and as ITK reads it; not within another key, or before values
+    in the same file.
+    """
+    path = meta(tmp_path / "a.mhd", data="a.raw")
+    whole = path.read_text().removesuffix("\n")
+    path.write_bytes(f"{whole}{end}".encode())
+    assert places(path) == PLACED
+    path.write_text(whole.partition("\nElementDataFile")[0])
+    with pytest.raises(Refused, match="ElementDataFile last"):
+        read_volume(path)
+    path = meta(tmp_path / "b.mha", raw=b"")
+    path.write_text(path.read_text().removesuffix("\n"))
+    with pytest.raises(Refused):
+        read_volume(path)
+
+
 def test_keys_behind_the_file_of_the_values_are_not_ignored_in_silence(tmp_path):
     """ITK reads no further than ElementDataFile."""
     for line, key in (
