@@ -48,7 +48,11 @@ META_KEYS = (
     Key("FileFormatVersion", "refused", "newer versions place images by ElementOrigin", (0,)),
     Key("NDims, DimSize", "applied", "three axes; further ones of one voxel are dropped"),
     Key("ElementType, ElementSpacing", "applied"),
-    Key("ElementSize", "applied", "where there is no ElementSpacing, else compared with it"),
+    Key(
+        "ElementSize",
+        "applied",
+        "where there is no ElementSpacing, else compared with it (a warning), unless 1",
+    ),
     Key("ElementNBits", "compared", "with ElementType"),
     Key("Offset", "applied", "of the first voxel's centre"),
     Key("Position, Origin, ImagePosition, ElementOrigin", "compared", "other names of Offset"),
@@ -97,7 +101,6 @@ AXES = ("2", "3", "4", "5")
 REPEATED = (
     ("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"),
     ("TransformMatrix", "Rotation", "Orientation", "ElementDirection"),
-    ("ElementSpacing", "ElementSize"),
     ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
 )
 #: Words of unknown keys that change values or places; see `EFFECTS`. ITK does not apply the units
@@ -201,6 +204,14 @@ def meta_header(path: Path, text: str) -> Header:
     }
     _check_repeated(path, entries, {**numbers, **flags})
     _check_axes(path, entries, numbers)
+    size, spacing = (numbers.get(name) for name in ("ElementSize", "ElementSpacing"))
+    filler = size is None or {*size} == {1.0}  # of writers that state the spacing alone
+    if not filler and spacing and not np.allclose(size, spacing, 1e-6, 1e-9):
+        warnings.warn(
+            f"{path}: expected an ElementSize as its ElementSpacing {entries['ElementSpacing']}, "
+            f"got {entries['ElementSize']}; ElementSpacing decides, as in ITK",
+            stacklevel=2,
+        )
     local, name = entries["ElementDataFile"].lower() == "local", entries["ElementDataFile"]
     if not local and (name.startswith("LIST") or "%" in name):
         raise checks.Refused(
@@ -282,10 +293,9 @@ def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
                 f"{checks.shown(entries[name])}"
             )
         numbers[name] = found
-    if 0 in numbers.get("ElementSpacing", []):
-        raise checks.Refused(
-            f"{path}: expected an ElementSpacing beyond 0, got {entries['ElementSpacing']}"
-        )
+    spacing = "ElementSpacing" if "ElementSpacing" in numbers else "ElementSize"
+    if 0 in numbers.get(spacing, []):
+        raise checks.Refused(f"{path}: expected a {spacing} beyond 0, got {entries[spacing]}")
     return numbers
 
 
