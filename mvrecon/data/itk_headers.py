@@ -22,8 +22,16 @@ LINE = 500
 BLANKS = " \t\n\r\v\f"
 #: Lengths are mm, which ITK takes all to be: NRRD's and MetaImage's unknown units.
 NO_UNIT = ("", "?")
+#: ITK's key, of an image that it joined of slices, for the largest difference of their distances
+#: from the spacing, and the share of the spacing from which it is a gap, as in a DICOM series.
+UNEVEN, GAP = "ITK_non_uniform_sampling_deviation", 0.01
 #: Keys of other formats that ITK copies into MetaImage, and into NRRD as key/value pairs.
 COPIED = (
+    Key(
+        UNEVEN,
+        "compared",
+        f"with the spacing: refused beyond {GAP:.0%} of it, as slices of a series were missing",
+    ),
     Key(
         "????|????, scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, "
         "bitpix, vox_offset, nifti_type, qform_code*, sform_code*, qfac, qoffset_*, quatern_*, "
@@ -172,8 +180,8 @@ FIELDS = {name.replace(" ", "") for key in NRRD_KEYS if key not in COPIED for na
 
 class Header(NamedTuple):
     """A checked header: the file of the values, their first byte in it, their encoding, the bytes
-    to skip once they are decoded (-1: all but the last ones), the unit of length in mm, and the
-    bytes of compressed values, if stated.
+    to skip once they are decoded (-1: all but the last ones), the unit of length in mm, the bytes
+    of compressed values, if stated, and the text of `UNEVEN`.
     """
 
     data: Path
@@ -182,6 +190,7 @@ class Header(NamedTuple):
     skip: int
     mm: float
     packed: int | None = None
+    uneven: str = "0"
 
 
 def meta_header(path: Path, text: str) -> Header:
@@ -232,7 +241,8 @@ def meta_header(path: Path, text: str) -> Header:
         )
     mm = _millimetres(path, [entries.get("DistanceUnits", "")], "DistanceUnits")
     size = None if stated is None else int(stated[0])
-    return Header(data, start, "gzip" if packed else "raw", min(0, skipped), mm, size)
+    encoding, uneven = "gzip" if packed else "raw", entries.get(UNEVEN, "0")
+    return Header(data, start, encoding, min(0, skipped), mm, size, uneven)
 
 
 def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
@@ -381,6 +391,17 @@ def check_length(path: Path, header: Header, needed: int, itemsize: int) -> None
         )
 
 
+def check_even(path: Path, header: Header, spacing_mm: float) -> None:
+    """Raise for an image that ITK joined of slices at other distances than its spacing."""
+    uneven = _finite([header.uneven])
+    if not uneven or uneven[0] * header.mm > GAP * spacing_mm:
+        raise checks.Refused(
+            f"{path}: expected slices {spacing_mm:g} mm apart, got {UNEVEN} "
+            f"{checks.shown(header.uneven)}: slices were missing when ITK joined them; read the "
+            f"DICOM series itself, or remove the key where they are even"
+        )
+
+
 def _inflated(header: Header, most: int) -> tuple[int, int]:
     """Bytes of a stream of zlib or gzip, and of its values, of which it reads a few beyond
     `most`.
@@ -419,7 +440,8 @@ def nrrd_header(path: Path, text: str) -> Header:
     quoted = [unit for text in units for unit in re.findall(r'"([^"]*)"', text)]
     mm = _millimetres(path, quoted or [""], "units and space units")
     names = {"raw": "raw", "gz": "gzip", "gzip": "gzip", "hex": "hex"}
-    return Header(path, first, names.get(encoding, "text"), skip, mm)
+    uneven = entries.get(UNEVEN, "0")
+    return Header(path, first, names.get(encoding, "text"), skip, mm, uneven=uneven)
 
 
 def _word(entries: Mapping[str, str], key: str) -> str:
@@ -453,6 +475,7 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
     alike = [pair for pair in pairs if pair[0].lower().replace(" ", "") in FIELDS]
     warn_of_unknown(path, [f"{name}:=" for name, _ in alike])  # no fields, whatever their names
     check_unknown(path, [pair for pair in pairs if pair not in alike], NRRD_KEYS, META_EFFECTS)
+    entries |= {name: value.strip() for name, value in pairs if name == UNEVEN}
     return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
 
 
