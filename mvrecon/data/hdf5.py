@@ -30,10 +30,18 @@ import torch
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
+from mvrecon.core.files.keys import warn_of_unknown
 from mvrecon.data.attenuation import UNITS, StoredUnit
-from mvrecon.data.linked import VOLUME_AXES, Place, check_order
+from mvrecon.data.linked import VOLUME_AXES, Place, check_order, texts_at, unknown_attributes
 from mvrecon.data.resample import Slab, Slabs, planes
-from mvrecon.data.storage import FORMAT, check_attributes, check_chunks, dataset_in, reading
+from mvrecon.data.storage import (
+    FORMAT,
+    check_attributes,
+    check_chunks,
+    dataset_in,
+    reading,
+    unknown_members,
+)
 from mvrecon.data.texts import texts_of, variable
 
 #: Attributes with their allowed texts, None where one may be missing; others that are read.
@@ -43,6 +51,7 @@ CHECKED_ATTRIBUTES = {
     "spacing_units": (None, "mm", "mm, order z, y, x"),
 }
 OPTIONAL_ATTRIBUTES = ("orientation", "labels")
+DATA_SETS = ("ct", "spacing", "id", "label")
 Texts = dict[str, list[str]]
 EXPECTED = (
     "an mvrecon volume file: HDF5 with datasets ct [n d h w] in HU (or 1/mm, activity), spacing "
@@ -353,8 +362,15 @@ def _check(path: Path, file: h5py.File) -> Texts:
         kinds = f"ct {ct.dtype}, spacing {spacing.dtype}, id {names.dtype}"
         raise checks.Refused(f"{path}: has {kinds}; expected numbers, floats and text")
     check_attributes(path, file, (*CHECKED_ATTRIBUTES, *OPTIONAL_ATTRIBUTES))
-    for dataset, known in ((ct, ()), (spacing, ("order",)), (names, ())):
+    unknown = unknown_members(path, file, DATA_SETS)
+    for dataset, known in (
+        (ct, ("units",)),
+        (spacing, ("units", "order")),
+        (names, ()),
+    ):
         check_attributes(path, dataset, known)
+        unknown += unknown_attributes(Place(path, dataset.name), known)
+    warn_of_unknown(path, unknown)
     check_order(Place(path, "/ct"), VOLUME_AXES, EXPECTED)
     check_order(Place(path, "/spacing"), VOLUME_AXES[1:], EXPECTED)
     for dataset in (spacing, names):
@@ -362,6 +378,10 @@ def _check(path: Path, file: h5py.File) -> Texts:
     texts = attributes_and_names(path, file, names)
     attributes = {key: next(iter(texts.get(f"@{key}", [])), None) for key in CHECKED_ATTRIBUTES}
     check_texts(path, attributes, texts["id"])
+    for dataset, unit in ((ct, attributes["units"]), (spacing, "mm")):
+        place = Place(path, dataset.name)
+        if (got := texts_at([place], "units").get(place, unit)) != unit:
+            raise checks.Refused(f"{place}: expected the units {unit}, got {checks.shown(got)}")
     mm = spacing[:]
     bad = ~((mm >= checks.SPACING_MM[0]) & (mm <= checks.SPACING_MM[1])).all(axis=1)
     if bad.any():

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.data.itk_headers import HEADER, check_length, meta_header, nrrd_header
+from mvrecon.data.itk_headers import HEADER, check_even, check_length, meta_header, nrrd_header
 from mvrecon.data.resample import Slabs, oriented, planes, right_angled, storable
 from mvrecon.geometry.grid import Grid
 
@@ -92,6 +92,7 @@ def itk_image(path: Path, least: int = 3) -> ItkImage:
         affine[:n, :n] = direction[:n, :n] * reader.GetSpacing()[:n]
         affine[:n, 3] = reader.GetOrigin()[:n]
         affine[:3] *= header.mm
+        check_even(path, header, float(np.linalg.norm(affine[:3, 2])))
     return ItkImage(path, size, dtype, affine, len(direction))
 
 

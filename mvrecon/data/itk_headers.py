@@ -22,8 +22,16 @@ LINE = 500
 BLANKS = " \t\n\r\v\f"
 #: Lengths are mm, which ITK takes all to be: NRRD's and MetaImage's unknown units.
 NO_UNIT = ("", "?")
+#: ITK's key, of an image that it joined of slices, for the largest difference of their distances
+#: from the spacing, and the share of the spacing from which it is a gap, as in a DICOM series.
+UNEVEN, GAP = "ITK_non_uniform_sampling_deviation", 0.01
 #: Keys of other formats that ITK copies into MetaImage, and into NRRD as key/value pairs.
 COPIED = (
+    Key(
+        UNEVEN,
+        "compared",
+        f"with the spacing: refused beyond {GAP:.0%} of it, as slices of a series were missing",
+    ),
     Key(
         "????|????, scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, "
         "bitpix, vox_offset, nifti_type, qform_code*, sform_code*, qfac, qoffset_*, quatern_*, "
@@ -48,7 +56,11 @@ META_KEYS = (
     Key("FileFormatVersion", "refused", "newer versions place images by ElementOrigin", (0,)),
     Key("NDims, DimSize", "applied", "three axes; further ones of one voxel are dropped"),
     Key("ElementType, ElementSpacing", "applied"),
-    Key("ElementSize", "applied", "where there is no ElementSpacing, else compared with it"),
+    Key(
+        "ElementSize",
+        "applied",
+        "where there is no ElementSpacing, else compared with it (a warning), unless 1",
+    ),
     Key("ElementNBits", "compared", "with ElementType"),
     Key("Offset", "applied", "of the first voxel's centre"),
     Key("Position, Origin, ImagePosition, ElementOrigin", "compared", "other names of Offset"),
@@ -97,7 +109,6 @@ AXES = ("2", "3", "4", "5")
 REPEATED = (
     ("Offset", "Position", "Origin", "ImagePosition", "ElementOrigin"),
     ("TransformMatrix", "Rotation", "Orientation", "ElementDirection"),
-    ("ElementSpacing", "ElementSize"),
     ("BinaryDataByteOrderMSB", "ElementByteOrderMSB"),
 )
 #: Words of unknown keys that change values or places; see `EFFECTS`. ITK does not apply the units
@@ -169,8 +180,8 @@ FIELDS = {name.replace(" ", "") for key in NRRD_KEYS if key not in COPIED for na
 
 class Header(NamedTuple):
     """A checked header: the file of the values, their first byte in it, their encoding, the bytes
-    to skip once they are decoded (-1: all but the last ones), the unit of length in mm, and the
-    bytes of compressed values, if stated.
+    to skip once they are decoded (-1: all but the last ones), the unit of length in mm, the bytes
+    of compressed values, if stated, and the text of `UNEVEN`.
     """
 
     data: Path
@@ -179,6 +190,7 @@ class Header(NamedTuple):
     skip: int
     mm: float
     packed: int | None = None
+    uneven: str = "0"
 
 
 def meta_header(path: Path, text: str) -> Header:
@@ -201,6 +213,14 @@ def meta_header(path: Path, text: str) -> Header:
     }
     _check_repeated(path, entries, {**numbers, **flags})
     _check_axes(path, entries, numbers)
+    size, spacing = (numbers.get(name) for name in ("ElementSize", "ElementSpacing"))
+    filler = size is None or {*size} == {1.0}  # of writers that state the spacing alone
+    if not filler and spacing and not np.allclose(size, spacing, 1e-6, 1e-9):
+        warnings.warn(
+            f"{path}: expected an ElementSize as its ElementSpacing {entries['ElementSpacing']}, "
+            f"got {entries['ElementSize']}; ElementSpacing decides, as in ITK",
+            stacklevel=2,
+        )
     local, name = entries["ElementDataFile"].lower() == "local", entries["ElementDataFile"]
     if not local and (name.startswith("LIST") or "%" in name):
         raise checks.Refused(
@@ -221,7 +241,8 @@ def meta_header(path: Path, text: str) -> Header:
         )
     mm = _millimetres(path, [entries.get("DistanceUnits", "")], "DistanceUnits")
     size = None if stated is None else int(stated[0])
-    return Header(data, start, "gzip" if packed else "raw", min(0, skipped), mm, size)
+    encoding, uneven = "gzip" if packed else "raw", entries.get(UNEVEN, "0")
+    return Header(data, start, encoding, min(0, skipped), mm, size, uneven)
 
 
 def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
@@ -234,7 +255,8 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
         line, end, _ = text[place:].partition("\n")
         place += len(line) + len(end)
         found = _pair(line)
-        if not end or not (found or not line.strip()):
+        last = found is not None and found[0] == "ElementDataFile"  # may end with the file
+        if not (end or last) or not (found or not line.strip()):
             raise checks.Refused(
                 f"{path}: expected a MetaImage header of lines such as 'DimSize = 4 3 2' with "
                 f"ElementDataFile last, got {checks.shown(line)}"
@@ -281,10 +303,9 @@ def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
                 f"{checks.shown(entries[name])}"
             )
         numbers[name] = found
-    if 0 in numbers.get("ElementSpacing", []):
-        raise checks.Refused(
-            f"{path}: expected an ElementSpacing beyond 0, got {entries['ElementSpacing']}"
-        )
+    spacing = "ElementSpacing" if "ElementSpacing" in numbers else "ElementSize"
+    if 0 in numbers.get(spacing, []):
+        raise checks.Refused(f"{path}: expected a {spacing} beyond 0, got {entries[spacing]}")
     return numbers
 
 
@@ -370,6 +391,17 @@ def check_length(path: Path, header: Header, needed: int, itemsize: int) -> None
         )
 
 
+def check_even(path: Path, header: Header, spacing_mm: float) -> None:
+    """Raise for an image that ITK joined of slices at other distances than its spacing."""
+    uneven = _finite([header.uneven])
+    if not uneven or uneven[0] * header.mm > GAP * spacing_mm:
+        raise checks.Refused(
+            f"{path}: expected slices {spacing_mm:g} mm apart, got {UNEVEN} "
+            f"{checks.shown(header.uneven)}: slices were missing when ITK joined them; read the "
+            f"DICOM series itself, or remove the key where they are even"
+        )
+
+
 def _inflated(header: Header, most: int) -> tuple[int, int]:
     """Bytes of a stream of zlib or gzip, and of its values, of which it reads a few beyond
     `most`.
@@ -408,7 +440,8 @@ def nrrd_header(path: Path, text: str) -> Header:
     quoted = [unit for text in units for unit in re.findall(r'"([^"]*)"', text)]
     mm = _millimetres(path, quoted or [""], "units and space units")
     names = {"raw": "raw", "gz": "gzip", "gzip": "gzip", "hex": "hex"}
-    return Header(path, first, names.get(encoding, "text"), skip, mm)
+    uneven = entries.get(UNEVEN, "0")
+    return Header(path, first, names.get(encoding, "text"), skip, mm, uneven=uneven)
 
 
 def _word(entries: Mapping[str, str], key: str) -> str:
@@ -442,6 +475,7 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
     alike = [pair for pair in pairs if pair[0].lower().replace(" ", "") in FIELDS]
     warn_of_unknown(path, [f"{name}:=" for name, _ in alike])  # no fields, whatever their names
     check_unknown(path, [pair for pair in pairs if pair not in alike], NRRD_KEYS, META_EFFECTS)
+    entries |= {name: value.strip() for name, value in pairs if name == UNEVEN}
     return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
 
 

@@ -226,6 +226,20 @@ def check_fields(path: Path, group: h5py.Group, own: str) -> None:
                 _check_effect(path, group, name, field, f"field {name!r} beside {beside!r}")
 
 
+def unknown_members(path: Path, file: h5py.File, known: Sequence[str]) -> list[str]:
+    """Names of the data sets, groups and links of a file that its reader does not know.
+
+    Raises:
+        Refused: one that would change values, such as a slope of each volume.
+    """
+    names = [name for name in file if name not in known]
+    for name in names:
+        link = file.get(name, getlink=True)
+        member = file[name] if isinstance(link, h5py.HardLink) else link
+        _check_effect(path, file, name, member, f"field {name!r} beside {known[0]!r}")
+    return names
+
+
 def fields_in(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
     """Names of the data sets in a group that have at most one axis or a word of `effects`, and of
     links with such a word, which are not followed; not those whose value is 0 or, as a gain of 1,

@@ -36,7 +36,11 @@ KEYS = (
     Key("resolution, unit", "applied", "of [geometry]; the volume's centre is the origin"),
     Key("representation.size, representation.datatype", "compared", "with those of [file1]"),
     Key("representation.bitsperelement", "compared", "with that of [file1]"),
-    Key("datarange", "compared", "with that of [file1], and with all values, unless 0 -1 or 0 0"),
+    Key(
+        "datarange",
+        "compared",
+        "with that of [file1], unless of floats and 0 -1, and with all values, unless 0 -1 or 0 0",
+    ),
     Key("regionofinterestend", "compared", "with size of [file1]: the last voxel"),
     Key("fileformat", "refused", "plain numbers, little endian", ("raw",)),
     *(
@@ -68,6 +72,8 @@ KEYS = (
 #: Sections whose unknown keys are checked, known keys, and the words of unknown ones.
 SECTIONS = ("[representation]", "[file1]", "[geometry]")
 KNOWN = {name for key in KEYS for name in key.names}
+#: Ranges that state none.
+NO_RANGE = ("", "0 -1", "0 0")
 #: Values of an entry that states nothing, and the share of a range that its text rounds.
 NOTHING, ROUNDING = ("", "none", "no", "false", "off", "not activated", "invisible"), 1e-5
 VGI_EFFECTS = {**EFFECTS, "mapping|swap|origin|translat|transform|shear|header.?size": None}
@@ -105,8 +111,11 @@ def _entries(path: Path) -> dict[str, str]:
         elif name not in KNOWN and name.partition(".")[2] not in KNOWN:
             pairs.append((name, value))
     check_unknown(path, pairs, KEYS, VGI_EFFECTS)
+    floats = entries.get("file1.datatype", "").lower() == "float"  # are not mapped to a range
     for name in ("size", "datarange", "datatype", "bitsperelement"):
         pair = [entries.get(f"{place}.{name}", "") for place in ("representation", "file1")]
+        if name == "datarange" and floats and _plain(pair[0]) in NO_RANGE:
+            continue
         if pair[0] and " ".join(pair[0].lower().split()) != " ".join(pair[1].lower().split()):
             raise Refused(
                 f"{path}: expected the {name} {shown(pair[0])} of [representation] in [file1], got "
@@ -121,7 +130,7 @@ def _range(path: Path, text: str, dtype: np.dtype) -> tuple[float, float]:
     Raises:
         Refused: no range, or one that integers of this type cannot have.
     """
-    if _plain(text) in ("", "0 -1", "0 0"):
+    if _plain(text) in NO_RANGE:
         return -math.inf, math.inf
     with file_errors(path, "has no datarange", "expected two numbers"):
         low, high = (float(word) for word in text.split())

@@ -71,6 +71,32 @@ def test_voxel_positions_match_simple_itk(turn, tmp_path):
         assert values[z, y, x].item() == pytest.approx(image.GetPixel((i, j, k)))
 
 
+@pytest.mark.parametrize("ending", [".mha", ".nrrd"])
+def test_a_gap_of_a_series_that_itk_joined_is_refused(ending, tmp_path):
+    """SimpleITK spreads the slices over the gap, with a warning and a key in the file that it
+    writes. Distances that are rounded are read: to 0.01 mm, also as ITK's key of 0.0001.
+    """
+
+    def joined(name, change=None, without=None):
+        folder = written(tmp_path / name, change=change)
+        if without:
+            (folder / without).unlink()
+        reader = sitk.ImageSeriesReader()
+        reader.SetFileNames(reader.GetGDCMSeriesFileNames(str(folder)))
+        sitk.WriteImage(reader.Execute(), str(file := tmp_path / f"{name}{ending}"))
+        return file
+
+    def rounded(k, tags):
+        x, y, z = tags["ImagePositionPatient"]
+        return {"ImagePositionPatient": [x, y, z + 0.01 * (k % 2)]}
+
+    for name, change in (("even", None), ("rounded", rounded)):
+        values, grid = read_volume(joined(name, change))
+        assert values.numel() == hu().size and grid.spacing[2] == pytest.approx(3, abs=0.01)
+    with pytest.raises(Refused, match="got ITK_non_uniform_sampling_deviation .* were missing"):
+        read_volume(joined("gap", without="2.dcm"))
+
+
 def test_a_link_to_a_slice_that_was_not_fetched_is_refused(tmp_path):
     """The last one leaves no gap. Hidden links, as of an editor, are none of the series."""
     written(tmp_path)

@@ -165,3 +165,44 @@ def test_labels_of_axes_are_compared(labels, message, tmp_path):
         Hdf5Views(path)
     with pytest.raises(Refused, match="axis 'x' at the place 1"):
         VolumeFile(ct).read(0)
+
+
+FIELDS = ("slope", "rescale_intercept", "scale", "units", "offset", "gain")
+
+
+@pytest.mark.parametrize("name", [*FIELDS, "origin", "affine", "mask", "split", "patient_age"])
+def test_other_data_sets_of_a_file_are_refused_or_named(name, tmp_path):
+    """Of volumes and of views: a slope of each volume is refused, unless it is 1; one warning names
+    the others. Also tried: a group, a link to another file, and attributes of the data.
+    """
+    path, ct = tmp_path / "views.h5", tmp_path / "ct.h5"
+    views(path)
+    write_volumes(ct, [Stored("a", VALUES, (1.0, 2.0, 3.0))])
+    for file in (path, ct):
+        with h5py.File(file, "r+") as opened:
+            opened[name] = np.full(3, 2.0)
+    if name in FIELDS:
+        for read in (lambda: VolumeFile(ct).read(0), lambda: Hdf5Views(path)):
+            with pytest.raises(Refused, match=f"no field '{name}' beside"):
+                read()
+        return
+    with pytest.warns(UserWarning, match=f"does not know: {name};") as found:
+        assert np.array_equal(VolumeFile(ct).read(0).ct, VALUES)
+    assert len(found) == 1
+    assert Hdf5Views(path).unknown == [name]
+
+
+@pytest.mark.parametrize(
+    ("place", "unit", "read"),
+    [("ct", "HU", True), ("ct", "1/cm", False), ("spacing", "mm", True), ("spacing", "cm", False)],
+)
+def test_units_of_volumes_and_spacings_are_compared(place, unit, read, tmp_path):
+    path = tmp_path / "ct.h5"
+    write_volumes(path, [Stored("a", VALUES, (1.0, 2.0, 3.0))])
+    with h5py.File(path, "r+") as file:
+        file[place].attrs["units"] = unit
+    if read:
+        assert VolumeFile(path).read(0).spacing == (1.0, 2.0, 3.0)
+        return
+    with pytest.raises(Refused, match=f"/{place}: expected the units .*, got '{unit}'"):
+        VolumeFile(path).read(0)

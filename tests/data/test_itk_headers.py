@@ -62,6 +62,7 @@ READ = {
     "ElementOrigin": (["ElementOrigin = 10 20 30.0"], {}, PLACED),
     "ImagePosition": (["ImagePosition = 10 20 30"], {"Offset": ""}, PLACED),
     "ElementSize": (["ElementSize = 1.0 2.0 3.0"], {}, PLACED),
+    "ElementSize as a filler": (["ElementSize = 1 1 1"], {}, PLACED),
     "twice": (["ElementSpacing = 1 2 3"], {}, PLACED),
     "axes from": (["AnatomicalOrientation = RAI"], {}, PLACED),
     "axes towards": (["AnatomicalOrientation = LPS"], {}, PLACED),
@@ -119,7 +120,8 @@ REFUSED = {
     "an unknown unit": ("Units", ["Units = cm"], {}),
     "two spacings": ("ElementSpacing", ["ElementSpacing = 1 2 4"], {}),
     "two units": ("DistanceUnits", ["DistanceUnits = mm", "DistanceUnits = cm"], {}),
-    "a size that differs": ("ElementSize", ["ElementSize = 1 2 4"], {}),
+    "a size of 0": ("ElementSize", ["ElementSize = 0 2 3"], {"ElementSpacing": ""}),
+    "two sizes": ("ElementSize", ["ElementSize = 1 2 3", "ElementSize = 1 2 4"], {}),
     "ImagePosition": ("ImagePosition", ["ImagePosition = 1 2 4"], {}),
     "ElementOrigin": ("ElementOrigin", ["ElementOrigin = 1 2 4"], {}),
     "ElementOrigin alone": ("ElementOrigin", ["ElementOrigin = 1 2 4"], {"Offset": ""}),
@@ -318,6 +320,32 @@ def test_long_lines_are_read_without_a_wait(place, line, tmp_path):
         except Refused as error:
             assert len(str(error)) < 2000
     assert all(len(str(one.message)) < 2000 for one in found)
+
+
+@pytest.mark.parametrize("size", ["1 2 4", "2 2 2", "0.5 1 1"])
+def test_the_spacing_decides_where_the_size_of_a_voxel_differs(size, tmp_path):
+    """As in ITK; a voxel may be smaller or larger than the distance to the next, as a slice is."""
+    path = meta(tmp_path / "a.mha", f"ElementSize = {size}")
+    with pytest.warns(UserWarning, match=f"got {size}; ElementSpacing decides"):
+        assert places(path) == PLACED
+
+
+@pytest.mark.parametrize("end", ["", " ", "\r", "\r\n", "\n\n"])
+def test_a_header_may_end_behind_its_last_key(end, tmp_path):
+    """As in files written by hand, and as ITK reads it; not within another key, or before values
+    in the same file.
+    """
+    path = meta(tmp_path / "a.mhd", data="a.raw")
+    whole = path.read_text().removesuffix("\n")
+    path.write_bytes(f"{whole}{end}".encode())
+    assert places(path) == PLACED
+    path.write_text(whole.partition("\nElementDataFile")[0])
+    with pytest.raises(Refused, match="ElementDataFile last"):
+        read_volume(path)
+    path = meta(tmp_path / "b.mha", raw=b"")
+    path.write_text(path.read_text().removesuffix("\n"))
+    with pytest.raises(Refused):
+        read_volume(path)
 
 
 def test_keys_behind_the_file_of_the_values_are_not_ignored_in_silence(tmp_path):

@@ -192,6 +192,19 @@ def test_entries_of_vgstudio_that_change_nothing_are_accepted(tmp_path):
         assert np.array_equal(volume.numpy(), VALUES) and np.allclose(grid.centre, 0)
 
 
+def test_a_range_of_the_file_alone_is_that_of_its_floats(tmp_path):
+    """The head may state none. Integers would be stretched to their type's range, and are
+    refused; also tried: a range of the file that the values exceed.
+    """
+    ranges = {"representation__datarange": "0 -1", "file1__datarange": "-3.0 20.0"}
+    assert np.array_equal(read_volume(vgi(tmp_path, **ranges))[0].numpy(), VALUES)
+    with pytest.raises(Refused, match="within the datarange -3.0 19.0, got 20"):
+        read_volume(vgi(tmp_path, **{**ranges, "file1__datarange": "-3.0 19.0"}))
+    whole = {"kind": "signed integer", "bits": 16, "values": VALUES.astype("<i2")}
+    with pytest.raises(Refused, match="expected the datarange '0 -1' of .representation"):
+        read_volume(vgi(tmp_path, **ranges, **whole))
+
+
 @pytest.mark.parametrize(
     ("values", "text"),
     [

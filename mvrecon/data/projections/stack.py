@@ -23,7 +23,13 @@ from mvrecon.core.machine import check_memory
 from mvrecon.data.attenuation import check_unit_of_views
 from mvrecon.data.itk import itk_image
 from mvrecon.data.linked import VIEW_AXES, Place, check_order, unknown_attributes
-from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
+from mvrecon.data.storage import (
+    check_attributes,
+    check_chunks,
+    dataset_in,
+    opened,
+    unknown_members,
+)
 from mvrecon.geometry.cameras.camera import Cameras
 
 #: Maximum number of views of a stack.
@@ -361,7 +367,8 @@ class Hdf5Views(ProjectionStack):
                     self.kind = "counts"
             if self.unit is not None:
                 check_unit_of_views(self.unit, f"{path}: ")
-            self.unknown = unknown_attributes(Place(path, "/views"), ATTRIBUTES)
+            self.unknown = unknown_members(path, file, ["views"])
+            self.unknown += unknown_attributes(Place(path, "/views"), ATTRIBUTES)
             names = [f"view {k}" for k in range(len(views))]
             super().__init__(path, names, views.shape[1:], views.dtype)
 

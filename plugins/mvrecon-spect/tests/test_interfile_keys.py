@@ -591,6 +591,24 @@ def test_an_image_of_castor_is_read_without_a_warning(tmp_path: Path):
         assert np.array_equal(read_interfile(path)[0], VALUES)
 
 
+def test_a_volume_of_castor_is_centred_unless_it_is_displaced(tmp_path: Path):
+    """CASToR writes offsets of 0 into every header; others displace the volume, and are refused:
+    along each axis, along all, and with the sign of STIR's origin.
+    """
+    offsets = [f"first pixel offset (mm) [{axis}] := 0" for axis in (1, 2, 3)]
+    lines = ["CASToR version := 3.1", *offsets]
+    read(tmp_path, ATTMAP, *lines)
+    with warnings.catch_warnings(action="error"):
+        values, grid = read_interfile(tmp_path / "a.hv")
+    assert np.array_equal(values, VALUES) and grid.centre.tolist() == [0.0, 0.0, 0.0]
+    for axis, shift in ((0, 20), (1, -2.5), (2, 5)):
+        displaced = [*offsets]
+        displaced[axis] = displaced[axis].replace(":= 0", f":= {shift}")
+        read(tmp_path, ATTMAP, lines[0], *displaced)
+        with pytest.raises(Refused, match="CASToR, where it displaces the volume"):
+            read_interfile(tmp_path / "a.hv")
+
+
 def test_headings_and_origins_of_other_programs_are_read_without_a_warning(tmp_path: Path):
     """Of GATE, SIMIND and (X)MedCon."""
     lines = [

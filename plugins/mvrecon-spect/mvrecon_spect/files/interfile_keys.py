@@ -50,6 +50,7 @@ KEYS = (
     Key("type of data", "refused", "", ("tomographic", "static", "dynamic", "pet", "other")),
     Key("camera zoom factor", "refused", "the scaling factors state the pixels", (1,)),
     Key("originating system", "applied", "mvrecon: every offset is a position"),
+    Key("castor version", "applied", "CASToR: an offset of 0 is that of a centred volume"),
     Key("imaging modality, version of keys", "ignored", "origin"),
     Key(
         "patient orientation",
@@ -104,7 +105,7 @@ KEYS = (
     ),
     Key(
         "date of keys, conversion program, program author, program version, program date, "
-        "castor version, original institution, contact person, data description, label, comment, "
+        "original institution, contact person, data description, label, comment, "
         "comments, date last processed, time last processed, archive status, "
         "patient name, patient id, patient dob, patient sex, patient age, patient height, "
         "patient weight, study id, study date, study time, study description, exam type, "

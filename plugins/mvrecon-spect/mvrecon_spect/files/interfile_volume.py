@@ -53,12 +53,13 @@ def read_interfile(
     Convention: STIR's `first pixel offset (mm)` is the centre of the first voxel, N // 2 voxels
     before its origin along x and y and at it along z. Where these offsets state the origin 0, which
     is STIR's default, its pinhole projector and this function centre the axis; in a file of mvrecon
-    (`originating system`) every offset is a position.
+    (`originating system`) every offset is a position. CASToR's offsets displace a centred volume.
 
     Raises:
         FileNotFoundError: the header or the data file does not exist.
         Refused: missing keys, offsets of some axes only or all 0 in a file of another program, a
-            size that does not match the file, or values that are not finite.
+            volume that CASToR displaced, a size that does not match the file, or values that are
+            not finite.
     """
     header = read_header(path, "volume")
     if place not in ("centred", "header"):
@@ -112,6 +113,13 @@ def _first_voxel(header: Header, size: Sequence[int], spacing: Sequence[float]) 
     first = [header.number(key) for key in keys]
     if header.text("originating system", "none") == SYSTEM:
         return first
+    if header.values.get("castor version"):
+        if any(first):
+            raise Refused(
+                f"{header.path}: expected {OFFSET!r} 0 in a file of CASToR, where it displaces the "
+                f"volume, got {first}; state the first voxel's centre, without 'CASToR version'"
+            )
+        return centred
     if not any(first) and max(size[:2]) > 1:
         raise Refused(
             f"{header.path}: expected {OFFSET!r} as the first voxel's centre, got 0 for all axes, "
