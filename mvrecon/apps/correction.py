@@ -29,7 +29,7 @@ from mvrecon.methods.calibration.from_data import (
     KINDS,
     UNCERTAIN_SHARE,
     Estimate,
-    calibrated,
+    estimated,
     unknowns,
 )
 from mvrecon.methods.calibration.hardening import Linearisation, fit_linearisation
@@ -163,7 +163,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
     for _ in range(MAX_FITS):
-        fit = calibrated(
+        fit = estimated(
             partial(operator_of, grid),
             rig,
             views,
@@ -181,6 +181,7 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
         axis = KEPT if change == KEPT else change._replace(offset=by.offset_px[0, 0].item())
         if abs(change.offset) <= change.uncertainty:
             break
+    fit.warn()
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
     if axis != KEPT:
         size["offset_u"] = axis.uncertainty

@@ -220,7 +220,7 @@ def test_a_calibrated_scan_is_reconstructed_from_the_file_that_it_writes(
     detector is turned about three axes and shifted. Nikon's images are mirrored without being told.
     """
 
-    def calibrated(operator_of, rig, views, free, **_):
+    def estimated(operator_of, rig, views, free, **_):
         by, none = Misalignment.none(len(rig)), torch.ones(len(rig)).double()
         by.tilt_degrees[:] = torch.tensor([3.0, -5.0, 2.0])
         by.offset_px[:] = torch.tensor([1.2, -0.7])
@@ -228,7 +228,7 @@ def test_a_calibrated_scan_is_reconstructed_from_the_file_that_it_writes(
             by.offset_px[::3] += torch.tensor([-2.0, 1.0])
         return Estimate(rig, by, none, [0.2, 0.1], [], (0.2, 0.1), True, dict.fromkeys(free, 0.1))
 
-    monkeypatch.setattr(correction, "calibrated", calibrated)
+    monkeypatch.setattr(correction, "estimated", estimated)
     monkeypatch.chdir(scan)
     ends = ("method=sirt", "method.iterations=2", "-q")
     out, again = tmp_path / "a" / "volume.nii.gz", tmp_path / "again.nii.gz"

@@ -277,6 +277,7 @@ class Estimate(NamedTuple):
         settled: whether the fit converged before the last round.
         uncertainty: uncertainty of each kind of parameter that was fitted, out of `KINDS`, in its
             unit.
+        remarks: why nominal values were kept, and that the fit did not converge, in sentences.
     """
 
     cameras: Cameras
@@ -287,6 +288,12 @@ class Estimate(NamedTuple):
     left_out: tuple[float, float]
     settled: bool
     uncertainty: dict[str, float]
+    remarks: tuple[str, ...] = ()
+
+    def warn(self) -> None:
+        """Warn of the remarks."""
+        for remark in self.remarks:
+            warnings.warn(remark, stacklevel=3)
 
 
 class _Fit(NamedTuple):
@@ -344,7 +351,6 @@ class Problem(NamedTuple):
         return squares**0.5 / views.norm().item()
 
 
-@torch.no_grad()
 def calibrated(
     operator_of: OperatorOf,
     cameras: Cameras,
@@ -400,7 +406,24 @@ def calibrated(
         >>> round(fit.misalignment.offset_px[0, 0].item(), 1)  # pixels
         -1.0
     """
-    every = unknowns(cameras, free)
+    estimate = estimated(operator_of, cameras, views, free, iterations, rounds, monitor, known)
+    estimate.warn()
+    return estimate
+
+
+@torch.no_grad()
+def estimated(
+    operator_of: OperatorOf,
+    cameras: Cameras,
+    views: Float[Tensor, "1 1 m v u"],
+    free: Sequence[str],
+    iterations: int = 15,
+    rounds: int = 12,
+    monitor: Callable[[Round], object] | None = None,
+    known: Mapping[str, float] | None = None,
+) -> Estimate:
+    """As `calibrated`, without its warnings: those of several fits are given for the last alone."""
+    every, remarks = unknowns(cameras, free), []
     A = operator_of(misaligned(cameras, Misalignment.none(len(cameras))))
     if tuple(views.shape) != (1, 1, *A.range_shape):
         raise ValueError(
@@ -436,24 +459,20 @@ def calibrated(
         kept += lost
         problem = problem._replace(unknowns=problem.unknowns.without(lost))
     if kept:
-        warnings.warn(
-            f"The views do not determine {', '.join(kept)}: kept at the nominal value",
-            stacklevel=3,
-        )
+        remarks += [f"The views do not determine {', '.join(kept)}: kept at the nominal value"]
     if not fit.settled:
-        warnings.warn(f"The rig still changed in the last of {rounds} rounds", stacklevel=3)
+        remarks += [f"The rig still changed in the last of {rounds} rounds"]
     values = fit.values
     left_out = (problem.left_out(start, iterations), problem.left_out(values, iterations))
     if (values != start).any() and left_out[1] > min(left_out[0], MAX_LEFT_OUT):
         within = values.new_tensor([uncertainty.get(kind, 0.0) for kind in numbers.kinds])
         # of a rig that is right, the fit finds as much, up to its uncertainty
         if left_out[1] > MAX_LEFT_OUT or ((values - start).abs() > within).any():
-            warnings.warn(
+            remarks += [
                 f"The nominal rig predicts left-out views with an error of {left_out[0]:.5g}, the "
                 f"fitted one with {left_out[1]:.5g} (expected less, and at most {MAX_LEFT_OUT}): "
-                f"the nominal rig is kept",
-                stacklevel=3,
-            )
+                f"the nominal rig is kept"
+            ]
             kept, uncertainty = [name for name in free if name not in known], {}
         values = start
     single = [kind for name in free for kind in PER_VIEW_KINDS.get(name, ())]
@@ -465,7 +484,9 @@ def calibrated(
         moves = motions(cameras[seen], isocentre(cameras))
         by.offset_px[seen] = least_deviations(by.offset_px[seen][None], moves, MIN_SHIFT_PX)[0]
     rig = misaligned(cameras, by)
-    return Estimate(rig, by, gains, fit.residual, kept, left_out, fit.settled, uncertainty)
+    return Estimate(
+        rig, by, gains, fit.residual, kept, left_out, fit.settled, uncertainty, tuple(remarks)
+    )
 
 
 def _motions_of_the_object(free: Sequence[str], cameras: Cameras) -> list[str]:

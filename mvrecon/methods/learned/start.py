@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.options import parts_in
+from mvrecon.core.options import check, parts_in
 from mvrecon.core.parts import LISTED, METHODS, ClassicalPart
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt
 from mvrecon.core.registry import check_options
@@ -24,7 +24,15 @@ from mvrecon.operators.memo import contents, digest
 from mvrecon.operators.operator import Projector
 
 #: Iterations of SIRT with momentum, or name and options of a classical method.
-Start = int | ClassicalPart
+Start = NonNegativeInt | ClassicalPart
+
+
+class _Settings(TypedDict):
+    """Settings of `ClassicalStart`."""
+
+    start: Start
+
+
 #: Maximum bytes of results that `CaseCache` caches.
 CACHE_BYTES = 2 << 30
 
@@ -93,12 +101,14 @@ class ClassicalStart:
 
     Raises:
         LookupError: an unknown name.
-        TypeError: an unknown option, or a mapping without a name.
+        TypeError: a learned method, an unknown option or a value of another type, or neither a
+            number of iterations nor a mapping with a name.
     """
 
     def __init__(self, start: Start):
         if isinstance(start, Mapping):
-            METHODS.check(start)
+            METHODS.check(start)  # that it has a name
+        check({"start": start}, _Settings)
         self.start, self._cases = start, CaseCache()
 
     def __call__(
