@@ -1,9 +1,11 @@
 """Options of learned methods are checked where a method is built, also in Python."""
 
-import inspect
 from typing import Literal, get_origin
 
+import numpy as np
 import pytest
+import torch
+from torch import nn
 
 from mvrecon.core.parts import METHODS, describe
 from mvrecon.core.signatures import alternatives
@@ -58,6 +60,18 @@ def test_a_start_is_checked_when_its_network_is_built(name, start, message):
         built(name, start=start)
 
 
-@pytest.mark.parametrize("start", [0, 12, {"name": "fbp"}, {"name": "sirt", "iterations": 3}])
+@pytest.mark.parametrize(
+    "start",
+    [
+        0,
+        12,
+        np.int64(3),
+        {"name": "fbp"},
+        {"name": "sirt", "iterations": np.int64(2)},
+        {"name": "cgls", "monitor": print, "iterations": 2},
+        {"name": "mlem", "background": torch.ones(1, 1, 4, 12, 12), "iterations": 2},
+    ],
+)
 def test_a_start_by_number_or_classical_method_is_built(start):
-    assert inspect.ismethod(built("world_unet", start=start).forward)
+    """Also with values that only Python can give: numbers of NumPy, functions and tensors."""
+    assert isinstance(built("world_unet", start=start), nn.Module)

@@ -5,8 +5,10 @@ scale of its normalisation, and data-consistency steps for line integrals and co
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
+from types import NoneType
 from typing import Annotated, Any, Literal, TypedDict
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -25,6 +27,10 @@ from mvrecon.operators.operator import Projector
 
 #: Iterations of SIRT with momentum, or name and options of a classical method.
 Start = NonNegativeInt | ClassicalPart
+
+
+#: Types of values of a configuration; others, such as tensors, are given in Python alone.
+PLAIN = (str, int, float, NoneType, list, tuple, Mapping)
 
 
 class _Settings(TypedDict):
@@ -106,10 +112,13 @@ class ClassicalStart:
     """
 
     def __init__(self, start: Start):
+        self.start: Start = int(start) if isinstance(start, np.integer) else start
+        plain: Any = self.start
         if isinstance(start, Mapping):
-            METHODS.check(start)  # that it has a name
-        check({"start": start}, _Settings)
-        self.start, self._cases = start, CaseCache()
+            METHODS.check(start)  # that it has a name, and names of options alone
+            plain = {key: value for key, value in start.items() if isinstance(value, PLAIN)}
+        check({"start": plain}, _Settings)
+        self._cases = CaseCache()
 
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False
