@@ -1,6 +1,6 @@
-"""Sanity checks of a reconstruction that raised no error: mirrored views, exchanged axes, a wrong
-axis of rotation or range of angles, counts read as line integrals, a volume that does not explain
-its views.
+"""Sanity checks of a reconstruction that raised no error: values that are none, mirrored views,
+exchanged axes, a wrong axis of rotation or range of angles, counts read as line integrals, a volume
+that does not explain its views.
 """
 
 import inspect
@@ -82,6 +82,11 @@ def sanity_checks(
         words.append(
             f"lost views, zero everywhere: {', '.join(map(str, outcome.lost))} (from 0); "
             f"correct=align replaces them by the volume's"
+        )
+    if bad := int((~outcome.volume.isfinite()).sum()):  # no limit below is exceeded by NaN
+        words.append(
+            f"{bad} of the volume's {outcome.volume.numel()} voxels are NaN or infinite: "
+            f"{method.name} has diverged, or divides by zero"
         )
     seen = SomeViews.of(scan, coarse_grid(scan), device) if _sees_integrals(scan) else None
     if seen:
