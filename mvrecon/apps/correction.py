@@ -3,6 +3,7 @@ of the rig from its views.
 """
 
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -163,15 +164,17 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
     views = _filled(whole, joined, scan.counts).to(device)
     bar.phase("calibrating", MAX_ROUNDS)
     for _ in range(MAX_FITS):
-        fit = calibrated(
-            partial(operator_of, grid),
-            rig,
-            views,
-            free,
-            rounds=MAX_ROUNDS,
-            monitor=lambda r: bar(*r),
-            known={} if axis == KEPT else {"offset_u": axis.offset / joined},
-        )
+        with warnings.catch_warnings(record=True) as remarks:  # those of the last fit count
+            warnings.simplefilter("always")
+            fit = calibrated(
+                partial(operator_of, grid),
+                rig,
+                views,
+                free,
+                rounds=MAX_ROUNDS,
+                monitor=lambda r: bar(*r),
+                known={} if axis == KEPT else {"offset_u": axis.offset / joined},
+            )
         by = fit.misalignment._replace(offset_px=joined * fit.misalignment.offset_px)
         if "offset_u" not in free or "tilt" not in fit.uncertainty:
             break
@@ -181,6 +184,8 @@ def calibrate(scan: Scan, free: Sequence[str], device: str, bar: Bar) -> tuple[S
         axis = KEPT if change == KEPT else change._replace(offset=by.offset_px[0, 0].item())
         if abs(change.offset) <= change.uncertainty:
             break
+    for remark in remarks:
+        warnings.warn(remark.message, stacklevel=2)
     size = {kind: x * (joined if "offset" in kind else 1) for kind, x in fit.uncertainty.items()}
     if axis != KEPT:
         size["offset_u"] = axis.uncertainty

@@ -1,6 +1,6 @@
-"""Sanity checks of a reconstruction that raised no error: mirrored views, exchanged axes, a wrong
-axis of rotation or range of angles, counts read as line integrals, a volume that does not explain
-its views.
+"""Sanity checks of a reconstruction that raised no error: values that are none, mirrored views,
+exchanged axes, a wrong axis of rotation or range of angles, counts read as line integrals, a volume
+that does not explain its views.
 """
 
 import inspect
@@ -79,6 +79,11 @@ def sanity_checks(
     limit, view_nrmse = MAX_VIEW_NRMSE, outcome.view_nrmse
     kind = getattr(METHODS.get(method.name), "data_kind", "integrals")
     lost = _of_lost_views(scan, outcome.lost)
+    if bad := int((~outcome.volume.isfinite()).sum()):  # no limit below is exceeded by NaN
+        words.append(
+            f"{bad} of the volume's {outcome.volume.numel()} voxels are NaN or infinite: "
+            f"{method.name} has diverged, or divides by zero"
+        )
     seen = SomeViews.of(scan, coarse_grid(scan), device) if _sees_integrals(scan) else None
     if seen:
         counts = _of_counts(seen.first) if kind == "integrals" else []

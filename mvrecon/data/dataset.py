@@ -39,7 +39,7 @@ class CaseStore:
     Files are written atomically, so several runs may share a folder; a damaged file is recomputed.
 
     Args:
-        folder: created if missing.
+        folder: created when the first case is written.
         made_of: settings of scene and projector and digests of their files and code: names,
             numbers, paths.
         scene: its `seed_of(index, seed)` gives the seed on which a case depends.

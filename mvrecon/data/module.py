@@ -15,6 +15,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from mvrecon import __version__
+from mvrecon.core.files.atomic import check_writable
+from mvrecon.core.files.checks import from_home
 from mvrecon.core.numbers import data_range_of
 from mvrecon.core.options import parts_in
 from mvrecon.core.parts import CAMERAS, REGISTRIES, SCENES, ProjectorPart, ScenePart
@@ -68,7 +70,7 @@ class Loading:
 
     batch_size: PositiveInt = 2
     workers: NonNegativeInt = 0
-    cache: str | None = None
+    cache: Path | None = None
     rigs: NonNegativeInt = 0
     fresh: bool = False
 
@@ -121,6 +123,7 @@ class SceneData(L.LightningDataModule):
             number.
         ValueError: sizes without training cases, scenes of different data range, or of one that is
             not positive and finite, a number that is too small.
+        OSError: `cache` is a file, or a folder that cannot be written.
     """
 
     def __init__(
@@ -147,6 +150,8 @@ class SceneData(L.LightningDataModule):
         self.projector = measurement.get("projector")
         self.acquisition = Acquisition.of(measurement.get("acquisition"))
         self.sizes, self.loading = dict(sizes), from_options(Loading, "data", loading)
+        if self.loading.cache is not None:
+            check_writable(from_home(self.loading.cache) / "case.h5")
         self.overlap, self.seed = overlap, seed
         self.rigs = dataset.training_rigs(measurement["camera"], self.loading.rigs)
         self._settings = {key: dict(scenes[key]) for key in ("train", "test")}

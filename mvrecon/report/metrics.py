@@ -79,19 +79,28 @@ def declared(name: str) -> Metric:
 
 @Metric(unit="dB", column="PSNR", format=".2f", higher_is_better=True)
 def psnr(volume: Tensor, truth: Tensor, inside: Tensor, data_range: float) -> float:
-    """Peak signal-to-noise ratio over the whole grid; infinite for equal volumes."""
+    """Peak signal-to-noise ratio over the whole grid; infinite for equal volumes.
+
+    Raises:
+        TypeError, ValueError: a data range that is no positive and finite number.
+    """
     return _psnr(volume, truth, data_range)
 
 
 @Metric(unit="dB", column="PSNR inside", format=".2f", higher_is_better=True)
 def psnr_inside(volume: Tensor, truth: Tensor, inside: Tensor, data_range: float) -> float:
-    """Peak signal-to-noise ratio inside the object; nan for an empty one."""
+    """Peak signal-to-noise ratio inside the object; nan for an empty one.
+
+    Raises:
+        TypeError, ValueError: as `psnr`.
+    """
     return _psnr(volume[inside], truth[inside], data_range) if inside.any() else math.nan
 
 
 def _psnr(x: Float[Tensor, "*n"], truth: Float[Tensor, "*n"], data_range: float) -> float:
     from torchmetrics.functional.image import peak_signal_noise_ratio
 
+    data_range = data_range_of(data_range)
     error = x - truth
     top = error.abs().max()
     if top == 0:

@@ -452,6 +452,21 @@ def test_relative_paths_are_those_of_the_command_s_folder(answer, tmp_path: Path
             assert re.search(rf"FileNotFoundError: .*{re.escape(str(tmp_path))}/scan\b", text), text
 
 
+def test_a_file_in_the_place_of_a_folder_is_named_before_anything_is_made(answer, tmp_path: Path):
+    """Of a run, of a sweep, of the cases that a training caches, or above one of them."""
+    file, text = tmp_path / "file", f"NotADirectoryError: {tmp_path}/file: expected a folder"
+    file.touch()
+    simulate, train = (import_module(f"mvrecon.apps.{app}").task for app in ("simulate", "train"))
+    for place in ("file", "file/run"):
+        assert text in answer(f"hydra.run.dir={place}", task=simulate, app="simulate")
+        sweep = ("-m", "seed=1,2", f"hydra.sweep.dir={place}")
+        assert text in answer(*sweep, task=simulate, app="simulate")
+        cached = ("experiment=smoke", f"data.cache={place}")
+        for chdir in ("true", "false"):
+            assert text in answer(*cached, f"hydra.job.chdir={chdir}", task=train)
+    assert file.is_file() and [path for path in tmp_path.rglob("*") if path.is_file()] == [file]
+
+
 @pytest.mark.parametrize(
     ("app", "work", "line"),
     [

@@ -313,6 +313,19 @@ def test_the_method_is_judged_with_its_own_options(right_rig, monkeypatch):
     assert FEW in words and used == [1.0, 1.0]
 
 
+@pytest.mark.parametrize("odd", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("name", ["sirt", "fdk"])
+def test_a_volume_with_values_that_are_none_is_named(views, right_rig, odd, name):
+    """A method that diverges returned NaN alone, whose NRMSE is above no limit. One voxel; also
+    tried: all voxels, and a class of a plugin.
+    """
+    volume = torch.full((16, 16, 16), 0.01)
+    volume[3, 4, 5] = odd
+    outcome = Outcome(volume, 0.0, None, torch.nan, lost=[])
+    (words,) = sanity_checks(scan_of(views), Method.of({"name": name}), outcome)
+    assert words.startswith(f"1 of the volume's 4096 voxels are NaN or infinite: {name} has")
+
+
 @pytest.mark.parametrize("slices", [1, 12])
 def test_parallel_beams_pass_every_check(slices):
     """Reversed columns of a parallel scan are those of the object turned by half a circle."""

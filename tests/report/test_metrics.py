@@ -14,6 +14,8 @@ from mvrecon.report.metrics import (
     case_metrics,
     declared,
     nrmse,
+    psnr,
+    psnr_inside,
     ssim_map,
     view_nrmse,
     volume_metrics,
@@ -255,6 +257,9 @@ def test_a_data_range_without_a_right_figure_is_refused(given):
     if given not in (1e-300, 5e-324, 1e-8):  # these are refused for the truth that they are below
         with pytest.raises((TypeError, ValueError), match=r"^data_range: expected .*, got "):
             case_metrics(truth * math.nan, scene["views"][0], scene, given)
+        for figure in (psnr, psnr_inside):
+            with pytest.raises((TypeError, ValueError), match=r"^data_range: expected .*, got "):
+                figure(truth + 0.2, truth, inside, given)
 
 
 @pytest.mark.parametrize("given", [1e-5, 1e8, 1e30, 1e150, 1e300, np.float32(2), 3])

@@ -23,9 +23,9 @@ from hydra.types import HydraContext, RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 
 from mvrecon.apps.config.grammar import quoted
-from mvrecon.core.files.atomic import check_plain, new_folder
+from mvrecon.core.files.atomic import check_plain, check_writable, new_folder
 from mvrecon.core.files.checks import MAX_YAML_BYTES, plain_name, shown, text_of, yaml_in
-from mvrecon.core.files.runs import flatten, run_around
+from mvrecon.core.files.runs import SETTINGS, flatten, run_around
 
 VERSION_BASE = "1.3"
 #: A file's directive of Hydra's for where its settings go.
@@ -197,7 +197,7 @@ def own_folder(config: DictConfig, sweeps: bool) -> list[str]:
         sweeps: whether the command line asks for a sweep.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be made or written.
         PermissionError: a resumed run's holds anything but files and folders.
     """
     key = "hydra.sweep.dir" if sweeps else "hydra.run.dir"
@@ -220,6 +220,8 @@ def own_folder(config: DictConfig, sweeps: bool) -> list[str]:
         if run is not None:
             check_plain(run)  # before Hydra opens a log in it
         changes[key] = str(folder)
+    else:
+        check_writable(place / SETTINGS)
     made[:] = new if folder == place else [folder, *new[1:]]
     with read_write(config), open_dict(config):
         for name, value in changes.items():

@@ -88,6 +88,8 @@ def check_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
     if path.is_dir():
         raise IsADirectoryError(f"{path}: expected a file, got a folder")
     nearest = _nearest(path)
+    if not nearest.is_dir():
+        raise NotADirectoryError(f"{nearest}: expected a folder, got a file")
     try:
         with TemporaryFile(dir=nearest):
             pass

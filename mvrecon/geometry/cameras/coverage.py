@@ -256,7 +256,7 @@ def check_coverage(
     Args:
         cameras: the rig.
         grid: the voxels.
-        remedy: advice that ends the warning.
+        remedy: advice that ends the warning where some detector sees the grid.
         bodies: true volumes of the first cases.
 
     Warns:
@@ -275,7 +275,7 @@ def check_coverage(
         words += f"; of the mass of the first {len(bodies)} case(s), {judged[-1]}"
     if not any(share.poor > MAX_POOR_SHARE for share in judged):
         return
-    warnings.warn(f"{words}. {_advice(cameras, grid)}; {remedy}", stacklevel=2)
+    warnings.warn(f"{words}. {_advice(cameras, grid, remedy)}", stacklevel=2)
 
 
 def _warn_of_rays_aside(cameras: Cameras, grid: Grid) -> None:
@@ -305,8 +305,10 @@ def _warn_of_rays_aside(cameras: Cameras, grid: Grid) -> None:
             )
 
 
-def _advice(cameras: Cameras, grid: Grid) -> str:
-    """The detector that sees the grid's inscribed cylinder, in words."""
+def _advice(cameras: Cameras, grid: Grid, remedy: str) -> str:
+    """The detector that sees the grid's inscribed cylinder, in words, and a remedy; or that none
+    does.
+    """
     rows, columns = cameras.shape
     try:
         v, u = covering_pixels(cameras, grid)
@@ -317,7 +319,8 @@ def _advice(cameras: Cameras, grid: Grid) -> str:
     mm = " x ".join(f"{_rounded_up(factor * step):g}" for step in pitch)
     return (
         f"Its inscribed cylinder needs a detector of {math.ceil(v)} x {math.ceil(u)} pixels (rows "
-        f"x columns) at this pitch, or {rows} x {columns} pixels of {mm} mm"
+        f"x columns) at this pitch, or {rows} x {columns} pixels of {mm} mm; "
+        f"{remedy}"
     )
 
 

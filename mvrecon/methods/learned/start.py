@@ -5,14 +5,16 @@ scale of its normalisation, and data-consistency steps for line integrals and co
 import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
+from types import NoneType
 from typing import Annotated, Any, Literal, TypedDict
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from mvrecon.core.numbers import divided
-from mvrecon.core.options import parts_in
+from mvrecon.core.options import check, parts_in
 from mvrecon.core.parts import LISTED, METHODS, ClassicalPart
 from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt
 from mvrecon.core.registry import check_options
@@ -24,7 +26,19 @@ from mvrecon.operators.memo import contents, digest
 from mvrecon.operators.operator import Projector
 
 #: Iterations of SIRT with momentum, or name and options of a classical method.
-Start = int | ClassicalPart
+Start = NonNegativeInt | ClassicalPart
+
+
+#: Types of values of a configuration; others, such as tensors, are given in Python alone.
+PLAIN = (str, int, float, NoneType, list, tuple, Mapping)
+
+
+class _Settings(TypedDict):
+    """Settings of `ClassicalStart`."""
+
+    start: Start
+
+
 #: Maximum bytes of results that `CaseCache` caches.
 CACHE_BYTES = 2 << 30
 
@@ -93,13 +107,18 @@ class ClassicalStart:
 
     Raises:
         LookupError: an unknown name.
-        TypeError: an unknown option, or a mapping without a name.
+        TypeError: a learned method, an unknown option or a value of another type, or neither a
+            number of iterations nor a mapping with a name.
     """
 
     def __init__(self, start: Start):
+        self.start: Start = int(start) if isinstance(start, np.integer) else start
+        plain: Any = self.start
         if isinstance(start, Mapping):
-            METHODS.check(start)
-        self.start, self._cases = start, CaseCache()
+            METHODS.check(start)  # that it has a name, and names of options alone
+            plain = {key: value for key, value in start.items() if isinstance(value, PLAIN)}
+        check({"start": plain}, _Settings)
+        self._cases = CaseCache()
 
     def __call__(
         self, geometry: Geometry, views: Float[Tensor, "b 1 m v u"], training: bool = False

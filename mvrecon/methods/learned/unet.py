@@ -5,12 +5,14 @@ and conversions between resolutions.
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
+
+from mvrecon.core.registry import check_choice
 
 #: Scale of a block's residual branch.
 BRANCH_SCALE = 0.5
@@ -39,6 +41,9 @@ class PlainUNet(nn.Module):
         widths: channels of each scale, the finest first.
         zero: number of first outputs that start at exactly zero, for corrections.
         precision: precision of the convolutions.
+
+    Raises:
+        ValueError: an unknown precision.
     """
 
     def __init__(
@@ -51,6 +56,7 @@ class PlainUNet(nn.Module):
         precision: Precision = "float32",
     ):
         super().__init__()
+        check_choice("precision", precision, get_args(Precision))
         kind = (nn.Conv2d, nn.Conv3d)[axes - 2]
         back = (nn.ConvTranspose2d, nn.ConvTranspose3d)[axes - 2]
         steps = list(zip(widths, widths[1:], strict=False))

@@ -3,11 +3,13 @@ back-projection of the slices.
 """
 
 from collections.abc import Sequence
+from typing import get_args
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.core.registry import check_choice
 from mvrecon.geometry.cameras.rigs import sinogram_rig
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.fdk import Filter
@@ -56,7 +58,8 @@ class RadonUNet(nn.Module):
         precision: precision of the U-Net's convolutions.
 
     Raises:
-        ValueError: an odd number of angles or fewer than 4, or no feature.
+        ValueError: an odd number of angles or fewer than 4, no feature, or an unknown filter or
+            precision.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class RadonUNet(nn.Module):
             )
         self.n_cameras, self.angles = n_cameras, angles
         self.start = ClassicalStart(start)
+        check_choice("filter", filter, get_args(Filter))
         self.filter: Filter = filter
         self.net = PlainUNet(3, 2 + n_cameras, features, widths, zero=1, precision=precision)
         self.head = nn.Sequential(

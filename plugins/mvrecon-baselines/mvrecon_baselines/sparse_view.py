@@ -10,12 +10,14 @@ and all networks initially return zero: before training, the volume is the filte
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import get_args
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
+from mvrecon.core.registry import check_choice
 from mvrecon.methods.classical.fdk import Filter, fbp, fdk
 from mvrecon.methods.classical.orbit import orbit_of
 from mvrecon.methods.learned.geometry import validated
@@ -44,11 +46,15 @@ class FbpUNet(nn.Module):
     Args:
         width, levels: width and levels of the network on slices, see `UNet2d`.
         filter: window of the ramp, as in `fbp`.
+
+    Raises:
+        ValueError: an unknown filter.
     """
 
     def __init__(self, width: int = 32, levels: int = 4, filter: Filter = "ram-lak"):
         super().__init__()
         self.image_net = UNet2d(1, 1, width, levels, zero=1)
+        check_choice("filter", filter, get_args(Filter))
         self.filter: Filter = filter
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
@@ -98,7 +104,7 @@ class SinogramUNet(nn.Module):
         filter: window of the ramp, as in `fbp`.
 
     Raises:
-        ValueError: a factor below one.
+        ValueError: a factor below one, or an unknown filter.
     """
 
     def __init__(
@@ -110,6 +116,7 @@ class SinogramUNet(nn.Module):
         self.sinogram_net: nn.Module = UNet2d(2, 1, width, levels, zero=1)
         self.image_net: nn.Module | None = None
         self.factor = factor
+        check_choice("filter", filter, get_args(Filter))
         self.filter: Filter = filter
 
     def forward(self, views: Float[Tensor, "b 1 m v u"], A: Projector) -> Reconstruction:
@@ -150,7 +157,7 @@ class DualDomain(SinogramUNet):
         filter: window of the ramp, as in `fbp`.
 
     Raises:
-        ValueError: a factor below one.
+        ValueError: a factor below one, or an unknown filter.
     """
 
     def __init__(

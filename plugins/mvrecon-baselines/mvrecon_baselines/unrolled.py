@@ -2,10 +2,13 @@
 and learned primal-dual.
 """
 
+from typing import get_args
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from mvrecon.core.registry import check_choice
 from mvrecon.methods.classical.fdk import Filter
 from mvrecon.methods.learned.geometry import geometry_of, validated
 from mvrecon.methods.learned.start import content_scale, nonzero
@@ -34,7 +37,7 @@ class ItNet(nn.Module):
         filter: window of the ramp, as in `fbp`.
 
     Raises:
-        ValueError: no iterations, or a negative number of channels.
+        ValueError: no iterations, a negative number of channels, or an unknown filter.
     """
 
     def __init__(
@@ -53,6 +56,7 @@ class ItNet(nn.Module):
                 f"iterations {iterations}, memory {memory}"
             )
         self.memory = memory
+        check_choice("filter", filter, get_args(Filter))
         self.filter: Filter = filter
         self.lengths = nn.Parameter(torch.ones(iterations))
         self.nets = nn.ModuleList(

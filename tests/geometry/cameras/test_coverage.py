@@ -129,6 +129,14 @@ def test_a_body_outside_of_the_field_is_warned_of_in_a_grid_that_is_well_seen():
         check_coverage(rig, grid, bodies=[body])
 
 
+def test_no_fitted_detector_is_advised_where_none_sees_the_grid():
+    """A grid beside the source's circle: the advice was to choose a detector that there is not."""
+    grid = Grid.centred(16, spacing=4.0, centre=(400.0, 0.0, 0.0))
+    with pytest.warns(UserWarning, match="No detector of this rig sees") as told:
+        check_coverage(circular(8, 400.0, 800.0, PLATE), grid)
+    assert "=fit" not in str(told[0].message)
+
+
 RIGS = {
     "circular": {"n_views": 12, "sid": 1000.0, "sdd": 1500.0},
     "arc": {"n_views": 7, "sid": 1000.0, "sdd": 1500.0, "arc_degrees": 120.0},
