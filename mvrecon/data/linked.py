@@ -17,6 +17,7 @@ from mvrecon.data.storage import (
     check_fields,
     dataset_in,
     opened,
+    value_in,
 )
 from mvrecon.data.texts import texts_of, variable
 
@@ -26,7 +27,8 @@ MAX_LINKS, MAX_GROUPS = 16, 2**14
 MAX_TEXTS = 16
 #: Most values of a data set that is read whole, such as the angles.
 MAX_VALUES = 2**20
-
+#: Attributes by which files state units.
+UNITS = ("units", "unit")
 
 #: Attributes of data sets besides those with a word of `EFFECTS`, which are refused; a warning
 #: names all others.
@@ -47,6 +49,7 @@ ATTRIBUTES = (
         "ignored",
         "texts, links and plots of NeXus and areaDetector",
     ),
+    Key("shape, dtype, doc", "ignored", "of the values as they are stored"),
     Key(
         "CLASS, NAME, VERSION, TITLE, FLAVOR, EXTDIM, REFERENCE_LIST, DIMENSION_LIST, IMAGE_*, "
         "INTERLACE_MODE, PALETTE, MATLAB_*, H5PATH, _Netcdf4*, _NC*, coordinates, standard_name, "
@@ -149,13 +152,16 @@ def check_around(place: Place) -> None:
     """Check the groups in which a data set and the links to it are, as `check_attributes` does.
 
     Raises:
-        Refused: an attribute of a group, or a field in it, that scales the data set.
+        Refused: an attribute of a group, or a field in it, that scales the data set; not the
+            category of units that nxtomo writes to transformations (NX_TRANSFORMATION).
     """
     for path, name, _ in (place, *place.links):
         with opened(path) as file:
             group: h5py.Group = file
             for part in name.strip("/").split("/"):
-                check_attributes(path, group)
+                own = Place(path, group.name)
+                category = texts_at([own], "units").get(own, "").startswith("NX_")
+                check_attributes(path, group, UNITS if category else ())
                 check_fields(path, group, part)
                 if isinstance(group.get(part, getlink=True), h5py.HardLink):
                     group = group[part]  # type: ignore[assignment]
@@ -163,14 +169,19 @@ def check_around(place: Place) -> None:
 
 def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
     """The attributes of a data set that neither its reader nor `ATTRIBUTES` know, as
-    <data set>@<name>.
+    <data set>@<name>; not those that are zero.
 
     Raises:
         Refused: one of `ATTRIBUTES` to refuse.
     """
     check_keys(place.path, ATTRIBUTES, lambda name: texts_at([place], name).get(place))
     with opened(place.path) as file:
-        names = [name for name in file[place.name].attrs if not has_effect(name, "")]
+        stored: Any = file[place.name]
+        names = [
+            name
+            for name in stored.attrs
+            if not has_effect(name, "") and value_in(stored, name, stored.attrs.get_id(name)) != 0
+        ]
     own = place.name.rpartition("/")[2]
     return [f"{own}@{name}" for name in unknown_names(names, ATTRIBUTES) if name not in known]
 
@@ -243,6 +254,14 @@ def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
         for name, texts in texts_of(path, *names).items():
             found[names[name]] = ":".join(texts)
     return found
+
+
+def units_of(places: Sequence[Place], names: Sequence[str] = UNITS) -> str:
+    """The units that data sets state by attributes of these names, several joined by " or "; empty
+    without one.
+    """
+    stated = {text for name in names for text in texts_at(places, name).values()}
+    return " or ".join(sorted(stated - {""}))
 
 
 #: Names of axes in their order: of frames, and of volumes.
