@@ -36,7 +36,8 @@ ATTRIBUTES = (
     Key("DISPLAY_ORIGIN", "refused", "the first row is the upper one, as views.flip_rows", ("UL",)),
     Key("IMAGE_SUBCLASS", "refused", "grey values", ("IMAGE_GRAYSCALE",)),
     Key(
-        "axes, *_indices, DIMENSION_LABELS, NDArrayDim*, transformation_type, vector, depends_on",
+        "axes, *_indices, DIMENSION_LABELS, dim0, dim1, dim2, NDArrayDim*, transformation_type, "
+        "vector, depends_on",
         "compared",
         "attributes of the frames and of the angles",
     ),
@@ -49,7 +50,11 @@ ATTRIBUTES = (
         "ignored",
         "texts, links and plots of NeXus and areaDetector",
     ),
-    Key("shape, dtype, doc", "ignored", "of the values as they are stored"),
+    Key(
+        "shape, dtype, doc, data_type, dimension, num_pixels_?, num_channels",
+        "ignored",
+        "of the values as they are stored; the last four of CIL",
+    ),
     Key(
         "CLASS, NAME, VERSION, TITLE, FLAVOR, EXTDIM, REFERENCE_LIST, DIMENSION_LIST, IMAGE_*, "
         "INTERLACE_MODE, PALETTE, MATLAB_*, H5PATH, _Netcdf4*, _NC*, coordinates, standard_name, "
@@ -267,8 +272,8 @@ def units_of(places: Sequence[Place], names: Sequence[str] = UNITS) -> str:
 #: Names of axes in their order: of frames, and of volumes.
 VIEW_AXES = (
     r".*(theta|angle|rotation|frame|view|projection|camera|image).*",
-    r"(.*[_ ])?(y|v|rows?|height)",
-    r"(.*[_ ])?(x|u|columns?|cols?|width)",
+    r"(.*[_ ])?(y|v|rows?|height|vertical)",
+    r"(.*[_ ])?(x|u|columns?|cols?|width|horizontal)",
 )
 VOLUME_AXES = ("n|index|volume|case|id", "z|d|depth", "y|h|rows?|height", "x|w|columns?|width")
 #: Short names of axes, which may stand in one word.
@@ -277,7 +282,7 @@ LETTERS = "ntzyxdhwvu"
 
 def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
     """Check the axes that a data set, or a group of NXdata, states by DIMENSION_LABELS, `axes`,
-    `order` or `<axis>_indices`; unknown names may be anywhere.
+    `order`, `<axis>_indices`, or CIL's `dim0` and so on; unknown names may be anywhere.
 
     Args:
         place: place of the data set or group.
@@ -296,6 +301,9 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
             raise Refused(f"{place}: expected {expected}, got the order {text!r}; remove it")
         if len(names) == len(axes):
             stated += [(name, n, attribute) for n, name in enumerate(names)]
+    for n in range(len(axes)):
+        if name := texts_at([place], f"dim{n}").get(place):
+            stated.append((name.lower(), n, f"dim{n}"))
     with opened(place.path) as file:
         indices = [name for name in file[place.name].attrs if name.endswith("_indices")]
     for attribute in indices:

@@ -150,7 +150,11 @@ KEYS = (
     *nexus_axes.KEYS,
 )
 #: Words of fields beside the frames that a warning names, and their values that change nothing.
-FIELD_EFFECTS = {**IMAGE_EFFECTS, "time_of_flight": 0, "binning": 1}
+FIELD_EFFECTS = {
+    **IMAGE_EFFECTS,
+    "time_of_flight|mask|bad.?pixel|shift|displace|jitter": 0,
+    "binning": 1,
+}
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Pixels by which a sample may move between views.

@@ -919,6 +919,27 @@ def test_units_of_angles_by_each_of_their_names(name, tmp_path):
         hdf5_views(path, "raw", "angles")
 
 
+CIL = ("angle", "vertical", "horizontal")
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (0, 2, 1), (2, 0, 1)])
+def test_the_order_of_axes_that_cil_states_is_compared(order, tmp_path):
+    """As its NEXUSDataWriter writes it: the second order is that of ASTRA's sinograms."""
+    path = tmp_path / "cil.nxs"
+    with h5py.File(path, "w") as file:
+        file["entry1/tomo_entry/data/data"] = np.moveaxis(grey(), order, (0, 1, 2))
+        stored = file["entry1/tomo_entry/data/data"]
+        stored.attrs.update({f"dim{n}": CIL[axis] for n, axis in enumerate(order)})
+        stored.attrs.update(data_type="AcquisitionData", num_pixels_h=COLUMNS, num_channels=1)
+    for layout, right in (("projections", (0, 1, 2)), ("sinogram", (1, 0, 2))):
+        options = {"dataset": "/entry1/tomo_entry/data/data", "flat": 6e4, "layout": layout}
+        if order == right:
+            assert opened(path, **options).shape == (ROWS, COLUMNS)
+            continue
+        with pytest.raises(Refused, match="at the place . by its dim"):
+            opened(path, **options)
+
+
 def test_an_option_of_hdf5_for_another_file_is_refused(tmp_path):
     np.save(tmp_path / "a.npy", grey())
     with pytest.raises(Refused, match=r"for views\.angles"):

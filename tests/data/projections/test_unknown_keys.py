@@ -318,6 +318,10 @@ FIELDS = {
         {"flatfield_applied": True, "countrate_correction_applied": True, "dark_corrected": 0},
         [],
     ),
+    "images and tables": (
+        {"mask": np.ones((2, 2)), "sample_shifts": np.ones((9, 2)), "preview": np.ones((2, 2))},
+        ["mask", "sample_shifts"],
+    ),
     "another axis": ({"time_of_flight": np.arange(9.0)}, ["time_of_flight"]),
     "names without such a word": (
         {"is_fft_shifted": True, "binning_x": 2, "magnification": 4.0, "rotation": 90, "skew": 0},
