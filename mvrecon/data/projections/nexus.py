@@ -280,8 +280,10 @@ class _Layout(NamedTuple):
             found[key] = cls._exchange(path, data, sinogram)
         if wanted is not None and not found:
             group = wanted.name.rpartition("/")[0] or "/"
-            layout = cls._tomo(wanted.path, group, wanted)
-            return layout._replace(angles=None, sinogram=sinogram)
+            layout = cls._tomo(wanted.path, group, wanted)._replace(angles=None)
+            if sinogram:  # what is stated of frames is not of rows
+                layout = layout._replace(sinogram=True, exposures=(), moves=(), detector=None)
+            return layout
         if len(found) != 1:
             if lost and not found:
                 raise lost[0]
