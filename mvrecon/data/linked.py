@@ -301,9 +301,9 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
             raise Refused(f"{place}: expected {expected}, got the order {text!r}; remove it")
         if len(names) == len(axes):
             stated += [(name, n, attribute) for n, name in enumerate(names)]
-    for n in range(len(axes)):
-        if name := texts_at([place], f"dim{n}").get(place):
-            stated.append((name.lower(), n, f"dim{n}"))
+    cil = [texts_at([place], f"dim{n}").get(place, "").lower() for n in range(len(axes))]
+    if all(cil):  # fewer are those of one image
+        stated += [(name, n, f"dim{n}") for n, name in enumerate(cil)]
     with opened(place.path) as file:
         indices = [name for name in file[place.name].attrs if name.endswith("_indices")]
     for attribute in indices:

@@ -943,6 +943,10 @@ def test_the_order_of_axes_that_cil_states_is_compared(order, tmp_path):
             continue
         with pytest.raises(Refused, match="at the place . by its dim"):
             opened(path, **options)
+    with h5py.File(path, "w") as file:  # of one slice
+        file["data"] = grey()[:, 0]
+        file["data"].attrs.update(dim0="angle", dim1="horizontal")
+    assert opened(path, dataset="data", flat=6e4, layout="sinogram").n_views == VIEWS
 
 
 def test_an_option_of_hdf5_for_another_file_is_refused(tmp_path):
