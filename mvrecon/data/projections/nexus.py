@@ -126,7 +126,8 @@ KEYS = (
         "calibration_date, angular_calibration, azimuthal_angle, trigger_*, raw_time_of_flight, "
         "description, serial_number, local_name, type, layout, input, crate, slot, diameter, "
         "solid_angle, efficiency, gas_pressure, detection_gas_path, sensor_*, detector_number, "
-        "acquisition_mode, frame_start_number, start_time, stop_time, detector_readout_time, tomo_n",
+        "acquisition_mode, frame_start_number, start_time, stop_time, detector_readout_time, "
+        "tomo_n",
         "ignored",
         "of a detector of NeXus: not of values",
     ),
