@@ -17,6 +17,7 @@ from mvrecon.data.storage import (
     check_fields,
     dataset_in,
     opened,
+    value_in,
 )
 from mvrecon.data.texts import texts_of, variable
 
@@ -26,7 +27,8 @@ MAX_LINKS, MAX_GROUPS = 16, 2**14
 MAX_TEXTS = 16
 #: Most values of a data set that is read whole, such as the angles.
 MAX_VALUES = 2**20
-
+#: Attributes by which files state units.
+UNITS = ("units", "unit")
 
 #: Attributes of data sets besides those with a word of `EFFECTS`, which are refused; a warning
 #: names all others.
@@ -34,7 +36,8 @@ ATTRIBUTES = (
     Key("DISPLAY_ORIGIN", "refused", "the first row is the upper one, as views.flip_rows", ("UL",)),
     Key("IMAGE_SUBCLASS", "refused", "grey values", ("IMAGE_GRAYSCALE",)),
     Key(
-        "axes, *_indices, DIMENSION_LABELS, NDArrayDim*, transformation_type, vector, depends_on",
+        "axes, *_indices, DIMENSION_LABELS, dim0, dim1, dim2, NDArrayDim*, transformation_type, "
+        "vector, depends_on",
         "compared",
         "attributes of the frames and of the angles",
     ),
@@ -46,6 +49,11 @@ ATTRIBUTES = (
         "equipment_component",
         "ignored",
         "texts, links and plots of NeXus and areaDetector",
+    ),
+    Key(
+        "shape, dtype, doc, data_type, dimension, num_pixels_?, num_channels",
+        "ignored",
+        "of the values as they are stored; the last four of CIL",
     ),
     Key(
         "CLASS, NAME, VERSION, TITLE, FLAVOR, EXTDIM, REFERENCE_LIST, DIMENSION_LIST, IMAGE_*, "
@@ -149,13 +157,16 @@ def check_around(place: Place) -> None:
     """Check the groups in which a data set and the links to it are, as `check_attributes` does.
 
     Raises:
-        Refused: an attribute of a group, or a field in it, that scales the data set.
+        Refused: an attribute of a group, or a field in it, that scales the data set; not the
+            category of units that nxtomo writes to transformations (NX_TRANSFORMATION).
     """
     for path, name, _ in (place, *place.links):
         with opened(path) as file:
             group: h5py.Group = file
             for part in name.strip("/").split("/"):
-                check_attributes(path, group)
+                own = Place(path, group.name)
+                category = texts_at([own], "units").get(own, "").startswith("NX_")
+                check_attributes(path, group, UNITS if category else ())
                 check_fields(path, group, part)
                 if isinstance(group.get(part, getlink=True), h5py.HardLink):
                     group = group[part]  # type: ignore[assignment]
@@ -163,14 +174,19 @@ def check_around(place: Place) -> None:
 
 def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
     """The attributes of a data set that neither its reader nor `ATTRIBUTES` know, as
-    <data set>@<name>.
+    <data set>@<name>; not those that are zero.
 
     Raises:
         Refused: one of `ATTRIBUTES` to refuse.
     """
     check_keys(place.path, ATTRIBUTES, lambda name: texts_at([place], name).get(place))
     with opened(place.path) as file:
-        names = [name for name in file[place.name].attrs if not has_effect(name, "")]
+        stored: Any = file[place.name]
+        names = [
+            name
+            for name in stored.attrs
+            if not has_effect(name, "") and value_in(stored, name, stored.attrs.get_id(name)) != 0
+        ]
     own = place.name.rpartition("/")[2]
     return [f"{own}@{name}" for name in unknown_names(names, ATTRIBUTES) if name not in known]
 
@@ -245,11 +261,19 @@ def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
     return found
 
 
+def units_of(places: Sequence[Place], names: Sequence[str] = UNITS) -> str:
+    """The units that data sets state by attributes of these names, several joined by " or "; empty
+    without one.
+    """
+    stated = {text for name in names for text in texts_at(places, name).values()}
+    return " or ".join(sorted(stated - {""}))
+
+
 #: Names of axes in their order: of frames, and of volumes.
 VIEW_AXES = (
     r".*(theta|angle|rotation|frame|view|projection|camera|image).*",
-    r"(.*[_ ])?(y|v|rows?|height)",
-    r"(.*[_ ])?(x|u|columns?|cols?|width)",
+    r"(.*[_ ])?(y|v|rows?|height|vertical)",
+    r"(.*[_ ])?(x|u|columns?|cols?|width|horizontal)",
 )
 VOLUME_AXES = ("n|index|volume|case|id", "z|d|depth", "y|h|rows?|height", "x|w|columns?|width")
 #: Short names of axes, which may stand in one word.
@@ -258,7 +282,7 @@ LETTERS = "ntzyxdhwvu"
 
 def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
     """Check the axes that a data set, or a group of NXdata, states by DIMENSION_LABELS, `axes`,
-    `order` or `<axis>_indices`; unknown names may be anywhere.
+    `order`, `<axis>_indices`, or CIL's `dim0` and so on; unknown names may be anywhere.
 
     Args:
         place: place of the data set or group.
@@ -277,6 +301,9 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
             raise Refused(f"{place}: expected {expected}, got the order {text!r}; remove it")
         if len(names) == len(axes):
             stated += [(name, n, attribute) for n, name in enumerate(names)]
+    cil = [texts_at([place], f"dim{n}").get(place, "").lower() for n in range(len(axes))]
+    if all(cil):  # fewer are those of one image
+        stated += [(name, n, f"dim{n}") for n, name in enumerate(cil)]
     with opened(place.path) as file:
         indices = [name for name in file[place.name].attrs if name.endswith("_indices")]
     for attribute in indices:

@@ -242,17 +242,17 @@ def unknown_members(path: Path, file: h5py.File, known: Sequence[str]) -> list[s
 
 def fields_in(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
     """Names of the data sets in a group that have at most one axis or a word of `effects`, and of
-    links with such a word, which are not followed; not those whose value is 0 or, as a gain of 1,
-    changes nothing.
+    links with such a word, which are not followed; not the axes of other data sets, nor those whose
+    value is 0 or, as a gain of 1, changes nothing.
     """
     found = []
     for name in group:
         link = group.get(name, getlink=True)
         field = group[name] if isinstance(link, h5py.HardLink) else link
         word = has_effect(name, "", effects)
-        small = isinstance(field, h5py.Dataset) and field.ndim < 2
+        small = isinstance(field, h5py.Dataset) and field.ndim < 2 and not field.is_scale
         if (small or word) and not isinstance(field, h5py.Group):
-            value = _value(group, name, field)
+            value = value_in(group, name, field)
             if has_effect(name, value, effects) if word else value != 0:
                 found.append(name)
     return found
@@ -260,14 +260,14 @@ def fields_in(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
 
 def _check_effect(path: Path, holder: Any, name: str, kind: Any, what: str) -> None:
     """Raise for an attribute of a holder, or a field in it, that would change values."""
-    if has_effect(name, value := _value(holder, name, kind)):
+    if has_effect(name, value := value_in(holder, name, kind)):
         raise Refused(
             f"{path}: expected no {what}, which the reader does not apply, got {value}; apply it, "
             f"and remove it"
         )
 
 
-def _value(holder: Any, name: str, kind: Any) -> Any:
+def value_in(holder: Any, name: str, kind: Any) -> Any:
     """A number of an attribute of a holder, or of a field in it; its type if it has others."""
     value = type(kind).__name__  # of a link, which is not followed
     if hasattr(kind, "dtype"):

@@ -51,10 +51,13 @@ EFFECTS = {
 #: Words of fields and texts beside images, which also state how these were corrected or turned.
 IMAGE_EFFECTS = {
     **EFFECTS,
-    "flip|mirror|transpos|invert|revers|swap|polar_angle|tilt|"
+    "flip|mirror|transpos|invert|revers(?!ion)|swap|polar_angle|tilt|"
     "(image|frame|detector|camera).?rotat": 0,
     "correct(ed|ion)|subtract|normali[sz]|distort|dark.?field|flat.?field|linear|"
-    "(?<![a-z])log(?=.?(appl|conv|corr|data|imag|intens|scal|transf))|fft": 0,
+    "(?<![a-z])log(?=.?(appl|conv|corr|data|imag|intens|scal|transf))|fft|"
+    "background(?!.?colou?r)|black.?level|pedestal|bit.?shift": 0,
+    "gamma(?!.?ray)": 1,
+    "(?<!a)gain": (1, 0),  # 0 dB
 }
 #: Values of any key with such a word that change nothing.
 OFF = ("no", "none", "off", "false", "unknown")

@@ -107,18 +107,32 @@ PROSE_SHOWN = 80
 PROSE = re.compile(
     r"(?<![<\w])(scaled|multiplied|divided|subtract(ed|ion)|correct(ed|ion)|normali[sz](ed|ation)|"
     r"flipped|mirrored|rotated|transposed|inverted|linearised|linearized|logarithms?|"
-    r"log.transform(ed)?|optical densit(y|ies))\b",
+    r"log.transform(ed)?|optical densit(y|ies)|(ln|log(10|2|e)?) ?\()\b",
     re.IGNORECASE,
 )
 #: Names of scales of the display, of stages and lenses; and units of other things than values.
 OF_DISPLAY = re.compile(
-    r"spatial|^stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|"
+    r"spatial|^stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|pixel.?(size|spacing)|"
     r"(?<![a-z])(date|time)(?=\W*$|.?(unit|scale))",
     re.IGNORECASE,
 )
 OTHER_UNITS = {
     *MILLIMETRES,
-    *("counts", "adu", "dn", "pixel", "pixels", "px", "inch", "in", "s", "sec", "ms", "us"),
+    *(
+        "count",
+        "counts",
+        "adu",
+        "dn",
+        "pixel",
+        "pixels",
+        "px",
+        "inch",
+        "in",
+        "s",
+        "sec",
+        "ms",
+        "us",
+    ),
     *("deg", "degrees", "rad"),
     *("v", "kv", "kev", "ev", "ma", "ua", "a", "w", "c", "k", "bit", "bits"),
 }
@@ -160,7 +174,8 @@ def effects(text: str) -> list[str]:
             if name.strip() not in known
             and not OF_DISPLAY.search(name)
             and any(
-                has_effect(name, part, IMAGE_EFFECTS) and part.lower() not in OTHER_UNITS
+                has_effect(name, part.rstrip("xX"), IMAGE_EFFECTS)
+                and part.lower() not in OTHER_UNITS
                 for part in re.findall(r"[^\s,;()\[\]]+", value)
             )
         }

@@ -14,12 +14,13 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_image import same
 from mvrecon.data.linked import (
+    UNITS,
     Place,
     beside,
     check_around,
     followed,
     numbers_at,
-    texts_at,
+    units_of,
     unknown_attributes,
 )
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
@@ -27,8 +28,6 @@ from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, ope
 
 #: Attributes of frames by which areaDetector states their part of the detector.
 REGION = ("NDArrayDimOffset", "NDArrayDimBinning", "NDArrayDimReverse")
-#: Attributes by which files state units of frames.
-UNITS = ("units", "unit")
 #: `H5S_SEL_ALL` of HDF5: a whole data set.
 SELECTS_ALL = 3
 
@@ -78,8 +77,7 @@ class Frames:
         self.region = {name: self._common(name) for name in REGION}
         places = dict.fromkeys([place, *(part.place for part in self.parts)])
         self.unknown = [name for one in places for name in unknown_attributes(one)]
-        units = {text for name in UNITS for text in texts_at([*places], name).values()}
-        self.units = " or ".join(sorted(units - {""}))
+        self.units = units_of([*places])
 
     def _common(self, name: str) -> np.ndarray | None:
         """An attribute of the data set, and of those of its parts; None if they have none."""

@@ -115,20 +115,26 @@ KEYS = (
         "fields beside the data set that they scale; apply them",
         (1, 0),
     ),
-    Key("field_of_view, estimated_cor_from_motor, x_rotation_axis_pixel_position", "ignored", AXIS),
-    Key("theta_white, theta_dark, distance, energy", "ignored", "not needed"),
+    Key(
+        "field_of_view, half_acquisition, estimated_cor_from_motor, ?_rotation_axis_pixel_position",
+        "ignored",
+        AXIS,
+    ),
+    Key("real_x_pixel_size, real_y_pixel_size", "ignored", "of the camera behind its optics"),
+    Key("theta_white, theta_dark, distance, energy, provenance", "ignored", "not needed"),
     Key(
         "calibration_date, angular_calibration, azimuthal_angle, trigger_*, raw_time_of_flight, "
         "description, serial_number, local_name, type, layout, input, crate, slot, diameter, "
         "solid_angle, efficiency, gas_pressure, detection_gas_path, sensor_*, detector_number, "
-        "acquisition_mode, frame_start_number, start_time, stop_time, tomo_n, "
-        "detector_readout_time",
+        "acquisition_mode, frame_start_number, start_time, stop_time, detector_readout_time, "
+        "tomo_n",
         "ignored",
         "of a detector of NeXus: not of values",
     ),
     Key(
         "name, title, short_title, chemical_formula, situation, preparation_date, temperature, "
-        "*_field, pressure, humidity, changer_position, unit_cell*, sample_orientation, "
+        "electric_field, magnetic_field, stress_field, pressure, humidity, changer_position, "
+        "unit_cell*, sample_orientation, "
         "orientation_matrix, ub_matrix, mass, density, relative_molecular_mass, concentration, "
         "volume_fraction, scattering_length_density, space_group, point_group, path_length*, "
         "component, sample_component, external_DAC, propagation_distance",
@@ -144,7 +150,11 @@ KEYS = (
     *nexus_axes.KEYS,
 )
 #: Words of fields beside the frames that a warning names, and their values that change nothing.
-FIELD_EFFECTS = {**IMAGE_EFFECTS, "time_of_flight": 0}
+FIELD_EFFECTS = {
+    **IMAGE_EFFECTS,
+    "time_of_flight|mask|bad.?pixel|shift|displace|jitter": 0,
+    "binning": 1,
+}
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Pixels by which a sample may move between views.
@@ -269,7 +279,11 @@ class _Layout(NamedTuple):
         if data is not None and (key := address(data)) not in found and key == (only or key):
             found[key] = cls._exchange(path, data, sinogram)
         if wanted is not None and not found:
-            return cls(wanted, sinogram=sinogram)
+            group = wanted.name.rpartition("/")[0] or "/"
+            layout = cls._tomo(wanted.path, group, wanted)._replace(angles=None)
+            if sinogram:  # what is stated of frames is not of rows
+                layout = layout._replace(sinogram=True, exposures=(), moves=(), detector=None)
+            return layout
         if len(found) != 1:
             if lost and not found:
                 raise lost[0]
@@ -287,7 +301,7 @@ class _Layout(NamedTuple):
 
     @classmethod
     def _tomo(cls, path: Path, group: str, frames: Place) -> "_Layout":
-        """The layout of NXtomo, by the group with the frames and their keys."""
+        """The layout of NXtomo, by the group with the frames, and with their keys if there."""
 
         def first(*names: str) -> Place | None:
             parts = group.strip("/").split("/")

@@ -15,7 +15,15 @@ import numpy as np
 
 from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.linked import Place, followed, numbers_at, texts_at, values_at
+from mvrecon.data.linked import (
+    UNITS,
+    Place,
+    followed,
+    numbers_at,
+    texts_at,
+    units_of,
+    values_at,
+)
 from mvrecon.data.storage import opened
 from mvrecon.geometry.cameras.formats.common import check_degrees, check_turning
 
@@ -24,6 +32,8 @@ DEGREES = {
     **dict.fromkeys(("deg", "degree", "degrees", "°"), 1.0),
     **dict.fromkeys(("rad", "radian", "radians"), math.degrees(1)),
 }
+#: Attributes by which files state units of angles, the last one of CIL.
+ANGLE_UNITS = (*UNITS, "angle_unit")
 #: Attributes of a transformation besides its units.
 ATTRIBUTES = ("transformation_type", "vector", "offset", "offset_units", "depends_on")
 #: Of these, and of a detector's transformations.
@@ -52,7 +62,7 @@ def degrees_of(angles: Place, kept: np.ndarray) -> list[float]:
         Refused: another number of angles, angles that are not finite, all equal, of unknown units,
             or that look like radians; see `_sense`.
     """
-    values = values_at(angles, ("units", *ATTRIBUTES))
+    values = values_at(angles, (*ANGLE_UNITS, *ATTRIBUTES))
     if values.size not in (len(kept), kept.sum()) or values.size != max(values.shape):
         raise Refused(
             f"{angles}: expected an angle for each of {len(kept)} frames"
@@ -62,16 +72,16 @@ def degrees_of(angles: Place, kept: np.ndarray) -> list[float]:
     degrees = degrees[kept] if len(degrees) == len(kept) else degrees
     if not np.isfinite(degrees).all():
         raise Refused(f"{angles}: expected finite angles of the views, got {shown(degrees)}")
-    unit = texts_at([angles], "units").get(angles)
-    factor = 1.0 if unit is None else DEGREES.get(unit.strip().lower())
+    unit = units_of([angles], ANGLE_UNITS)
+    factor = DEGREES.get(unit.strip().lower()) if unit else 1.0
     if factor is None:
         raise Refused(f"{angles}: expected units of {', '.join(DEGREES)}, got {shown(unit)}")
     degrees *= factor * _sense(angles)
     with file_errors(angles.path, f"{angles.name} is no turn", "give views.angles"):
         check_turning(degrees.tolist())
-        if unit is None:
+        if not unit:
             check_degrees(degrees.tolist(), False, "angles without units")
-    if unit is not None:
+    if unit:
         try:
             check_degrees(degrees.tolist(), False, "angles")
         except ValueError as error:

@@ -35,6 +35,8 @@ EDF_TYPES = {
 }
 #: Exposure times in s by their names in EDF.
 EDF_TIMES = ("count_time", "ExposureTime", "acq_expo_time")
+#: Parts of the detector, and pixels that form one, by their names in EDF.
+EDF_REGION = tuple("image_bin image_roi col_beg col_end row_beg row_end col_bin row_bin".split())
 EDF_KEYS = (
     Key("Dim_1, Dim_2", "applied"),
     Key("ByteOrder", "applied"),
@@ -47,6 +49,7 @@ EDF_KEYS = (
     Key("Dummy", "refused", "its pixels are bad: replace them, and give views.bad_pixels"),
     Key(", ".join(EDF_TIMES), "compared", "of views and flat fields, as ExposureTime, from s"),
     Key("counter_mne, counter_pos", "compared", "the ring's current srcur, as ExposureTime"),
+    Key(", ".join(EDF_REGION), "compared", "of views and flat fields; warned of"),
     Key("optic_used, PSize_*", "ignored", "the pixel size is asked for"),
     Key("Size, HeaderID, EDF_*, VersionNumber, Image", "ignored", "of the file"),
     Key(
@@ -181,6 +184,7 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
     numbers = (number_of(text, f"{file}: {name}") for name, text in times.items())
     exposed = {f"{1000 * time:.6g}" for time in numbers if time is not None}
     texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
+    texts |= {name: stated.get(name, "") for name in EDF_REGION}
     unknown = unknown_entries(stated, EDF_KEYS)
     return kind, {name: [text] for name, text in texts.items() if text}, unknown
 

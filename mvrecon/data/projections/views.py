@@ -132,7 +132,10 @@ class MeasuredViews:
                 f"without flat fields"
             )
         other = kind in PLAIN_UNITS and not PLAIN_UNITS[kind].fullmatch(stack.units)
-        warn_of_unknown(stack.path, [*stack.unknown, *[f"units={stack.units}"] * other])
+        given = (*names.values(), *own, options.exposure, options.bad_pixels)
+        used = {str(name).rpartition("/")[2] for name in given}  # data sets of the scan's file
+        unknown = [name for name in stack.unknown if name not in used]
+        warn_of_unknown(stack.path, [*unknown, *[f"units={stack.units}"] * other])
         if kind == "counts" and options.linearise is not None:
             raise Refused(
                 f"{options.path}: expected line integrals or intensities for views.linearise, got "

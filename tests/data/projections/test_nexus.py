@@ -696,6 +696,8 @@ def test_a_detector_that_is_turned_is_warned_of(name, kind, warned, tmp_path):
     if kind:
         place = f"entry__instrument__detector__transformations__{name}"
         stated(path, **{place: {"transformation_type": kind}})
+    with h5py.File(path, "a") as file:  # by nxtomo 3
+        file["entry/instrument/detector/transformations"].attrs["units"] = "NX_TRANSFORMATION"
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         opened(path)
@@ -878,6 +880,73 @@ def test_a_chunk_may_be_one_frame_of_any_size(many, tmp_path, monkeypatch):
         return
     with pytest.raises(Refused, match=r"at most 96 bytes .* h5repack -l /raw:CHUNK=1x6x8 writes"):
         opened(tmp_path / "a.h5", dataset="raw", flat=FLAT).whole()
+
+
+def test_what_stands_beside_frames_counts_whatever_their_name_is(tmp_path):
+    """Frames by name with keys, a mask and a greatest value; also of a link in another group."""
+    path, mask = tmp_path / "a.h5", np.zeros((ROWS, COLUMNS), "u1")
+    mask[2, 3] = 1
+    values = frames()
+    values[2, 0, 0] = 61_000  # of the first view
+    with h5py.File(path, "w") as file:
+        file["camera/raw"], file["camera/image_key"] = values, np.where(KEYS < 0, 3, KEYS)
+        file["camera/pixel_mask"], file["camera/saturation_value"] = mask, 61_000
+        file["links/raw"] = h5py.SoftLink("/camera/raw")
+    for name in ("camera/raw", "links/raw"):
+        views = opened(path, dataset=name, find_bad_pixels=False)
+        whole = views.whole()
+        right = torch.from_numpy(mask == 0).repeat(VIEWS, 1, 1)
+        right[0, 0, 0] = False
+        assert torch.equal(whole.mask, right)
+        good = whole.mask.numpy()
+        np.testing.assert_allclose(whole.views.numpy()[good], integrals()[good], atol=1e-5)
+        assert views.stack.rig["name"] is None  # angles of frames by name are named as well
+    with h5py.File(path, "w") as file:
+        file["raw"], file["pixel_mask"] = grey().swapaxes(0, 1), mask
+        file["count_time"], file["sample/x_translation"] = np.arange(1.0, VIEWS + 1), ANGLES
+    with warnings.catch_warnings(action="error"):  # of rows of sinograms no frame is stated
+        hdf5_views(path, "raw", layout="sinogram")
+
+
+@pytest.mark.parametrize("name", ["units", "unit", "angle_unit"])
+def test_units_of_angles_by_each_of_their_names(name, tmp_path):
+    """The last one is CIL's."""
+    for unit, angles in (("degree", ANGLES), ("radian", np.radians(ANGLES))):
+        path = tmp_path / f"{unit}.h5"
+        with h5py.File(path, "w") as file:
+            file["raw"], file["angles"] = grey(), angles
+            file["angles"].attrs[name] = unit
+        stack = hdf5_views(path, "raw", "angles")
+        np.testing.assert_allclose(stack.rig["angles"], ANGLES, atol=1e-9)
+    with h5py.File(path, "a") as file:
+        file["angles"].attrs.update({"units": "degree", "angle_unit": "radian"})
+    with pytest.raises(Refused, match="expected units of deg.*got 'degree or radian'"):
+        hdf5_views(path, "raw", "angles")
+
+
+CIL = ("angle", "vertical", "horizontal")
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (0, 2, 1), (2, 0, 1)])
+def test_the_order_of_axes_that_cil_states_is_compared(order, tmp_path):
+    """As its NEXUSDataWriter writes it: the second order is that of ASTRA's sinograms."""
+    path = tmp_path / "cil.nxs"
+    with h5py.File(path, "w") as file:
+        file["entry1/tomo_entry/data/data"] = np.moveaxis(grey(), order, (0, 1, 2))
+        stored = file["entry1/tomo_entry/data/data"]
+        stored.attrs.update({f"dim{n}": CIL[axis] for n, axis in enumerate(order)})
+        stored.attrs.update(data_type="AcquisitionData", num_pixels_h=COLUMNS, num_channels=1)
+    for layout, right in (("projections", (0, 1, 2)), ("sinogram", (1, 0, 2))):
+        options = {"dataset": "/entry1/tomo_entry/data/data", "flat": 6e4, "layout": layout}
+        if order == right:
+            assert opened(path, **options).shape == (ROWS, COLUMNS)
+            continue
+        with pytest.raises(Refused, match="at the place . by its dim"):
+            opened(path, **options)
+    with h5py.File(path, "w") as file:  # of one slice
+        file["data"] = grey()[:, 0]
+        file["data"].attrs.update(dim0="angle", dim1="horizontal")
+    assert opened(path, dataset="data", flat=6e4, layout="sinogram").n_views == VIEWS
 
 
 def test_an_option_of_hdf5_for_another_file_is_refused(tmp_path):

@@ -205,6 +205,24 @@ def test_entries_of_ctpro_count_as_those_of_the_scan(tmp_path):
     path.write_text(f"{own}AngleFile_Use=False\r\nVoxelScalingFactor=2\r\n", "latin-1")
     with warnings.catch_warnings(action="error"):
         nikon.read(path)
+        step = nikon.header(path).number("AngularStep")
+        (tmp_path / "a.ang").write_text("".join(f"{k}: {k * step}\n" for k in range(9)))
+        path.write_text(f"{own}AngleFile_Use=True\r\n", "latin-1")
+        nikon.read(path)  # its steps are compared
+
+
+def test_entries_of_sections_that_no_reader_knows_are_named(tmp_path):
+    """As Nikon's scatter correction writes its own; not those of the tube and of texts."""
+    path = xtekct(tmp_path)
+    own = path.read_text("latin-1")
+    known = "[Xrays]\nXraykV=90\n[DICOM]\nDICOMTags=<scale>2</scale>\n[ScatterCorrection]\n"
+    path.write_text(f"{own}{known}VeilingGlareApplied=0\n", "latin-1")
+    with warnings.catch_warnings(action="error"):
+        nikon.read(path)
+    path.write_text(f"{own}{known}VeilingGlareApplied=1\n[Helix]\nPitch=3\n", "latin-1")
+    named = r"know: \[scattercorrection\] veilingglareapplied, \[helix\] pitch;"
+    with pytest.warns(UserWarning, match=named):
+        nikon.read(path)
 
 
 @pytest.mark.parametrize(

@@ -250,6 +250,17 @@ def test_exposures_of_edf_are_applied_by_their_name(case, tmp_path):
         assert opened(tmp_path / "other.edf", flat=6e4).stack.exposure("ExposureTime") is None
 
 
+def test_the_part_of_the_detector_that_edf_states_is_compared(tmp_path):
+    """As SPEC and Lima of the ESRF write it."""
+    spec = {f"{axis}_{end}": n for axis in ("col", "row") for end, n in (("end", 11), ("bin", 2))}
+    lima = {"image_bin": "<2x2>", "image_roi": "<0,0>-<12x12>"}
+    for k, keys in enumerate((spec, lima)):
+        edf(tmp_path / f"{k}.edf", grey(20_000)[0].astype("u2"), **keys)
+        _, stated, unknown = rtk_images._check_edf(tmp_path / f"{k}.edf")
+        assert stated == {name: [str(value)] for name, value in keys.items()}
+        assert unknown == []
+
+
 @pytest.mark.parametrize("text", ["-", "auto", "1e", "0.1.2", "nan"])
 def test_times_of_edf_that_are_no_numbers_are_warned_of(text, tmp_path):
     path = tmp_path / "a.edf"

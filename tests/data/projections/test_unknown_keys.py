@@ -129,6 +129,11 @@ TEXTS = {
     "ImageJ=1.54f\ngain=3": ["gain"],
     "SCIFIO=0.37\nscales=0.5,0.5\nunits=micron,micron\nimages=1": [],
     '<MetaData><prop id="autoscale-state" value="on"/></MetaData>': [],
+    "Gamma = 2.2\nBlackLevel: 64\nBackground=0\nPedestal: 100": ["BlackLevel", "Gamma", "Pedestal"],
+    "SoftwareVersion=8.3\nGain=0\nPre-Amp Gain: 1x\nZAxisUnit=Count\nReverseX=0": [],
+    "Gain: 12.5 dB\nReverseX: 1\nPre-Amp Gain: 2x": ["Gain", "Pre-Amp Gain", "ReverseX"],
+    "-ln(I/I0) x 1000": ["-ln(I/I0) x 1000"],
+    "Scaled Image Pixel Size (um)=5.0\nGamma: 1.0\nBackground colour: black": [],
     "x" * 10**6 + "gain": [],
 }
 
@@ -227,7 +232,7 @@ ATTRIBUTES = {
         [],
     ),
     "other": ({"flatfield_corrected": True, "log": 1}, ["data@flatfield_corrected", "data@log"]),
-    "a range": ({"min": 0.0, "max": 5.0}, ["data@max", "data@min"]),
+    "a range": ({"min": -1.0, "max": 5.0}, ["data@max", "data@min"]),
     "rows upwards": ({"DISPLAY_ORIGIN": "LL"}, "DISPLAY_ORIGIN UL, got 'll'"),
     "indices of colours": ({"IMAGE_SUBCLASS": np.bytes_("IMAGE_INDEXED")}, "IMAGE_SUBCLASS"),
     "a valid range": ({"valid_range": [0, 100]}, "valid_range"),
@@ -254,10 +259,49 @@ def test_attributes_of_frames_that_no_reader_knows_are_named(case, tmp_path):
             opened(path, **options)
 
 
+def test_attributes_that_are_zero_are_not_named(tmp_path):
+    path = tomo(tmp_path / "a.nxs")
+    with h5py.File(path, "a") as file:
+        file[FRAMES].attrs.update(normalised=0, log=False, shift=[0, 0], bits=12)
+        file["entry/sample/rotation_angle"].attrs.update(initial_angle=0.0)
+    assert named(path) == ["data@bits"]
+
+
+@pytest.mark.parametrize("flat", ["flat_field", "/flat_field", "{path}:/flat_field"])
+def test_data_sets_that_options_name_are_known(flat, tmp_path):
+    """The same are named where no option uses them."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file["raw"], file["flat_field"] = grey(), np.full(grey()[0].shape, 6e4)
+        file["angles"], file["doses"] = np.linspace(0, 360, 12, endpoint=False), np.full(12, 2.0)
+    used = {"angles": "angles", "flat": flat.format(path=path), "exposure": "/doses"}
+    assert named(path, dataset="raw", **used) == []
+    assert named(path, dataset="/raw", **GIVEN) == ["angles", "doses", "flat_field"]
+
+
+def test_axes_of_frames_are_known(tmp_path):
+    """As xarray and netCDF store them: a field for each axis, of its own name."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        frames = file.create_dataset("raw", data=grey())
+        for axis, (name, size) in enumerate(zip(("view", "y", "x"), grey().shape, strict=True)):
+            file[name] = np.arange(1.0, size + 1)
+            file[name].make_scale(name)
+            frames.dims[axis].attach_scale(file[name])
+        file["width"] = np.arange(8.0)
+    assert named(tmp_path / "a.h5", dataset="raw", **GIVEN) == ["width"]
+
+
 FIELDS = {
     "ordinary": (
         {
-            **{"detector_number": 1, "x_pixel_offset": np.arange(8.0), "distance": 1.0},
+            **{"half_acquisition": True, "real_x_pixel_size": 5e-6},
+            **{"x_rotation_axis_pixel_position": 3.2, "y_rotation_axis_pixel_position": 1.0},
+            **{
+                "detector_number": 1,
+                "binning_x": 1,
+                "x_pixel_offset": np.arange(8.0),
+                "distance": 1.0,
+            },
             **{"calibration_date": "2020", "polar_angle": 0.0, "gain": 1.0, "bias": 0},
             **{"efficiency": 0.9, "frame_start_number": 1, "flip_rows": False, "depends_on": "."},
         },
@@ -273,6 +317,10 @@ FIELDS = {
     "what detectors apply": (
         {"flatfield_applied": True, "countrate_correction_applied": True, "dark_corrected": 0},
         [],
+    ),
+    "images and tables": (
+        {"mask": np.ones((2, 2)), "sample_shifts": np.ones((9, 2)), "preview": np.ones((2, 2))},
+        ["mask", "sample_shifts"],
     ),
     "another axis": ({"time_of_flight": np.arange(9.0)}, ["time_of_flight"]),
     "names without such a word": (

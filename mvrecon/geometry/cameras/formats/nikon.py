@@ -83,6 +83,8 @@ KEYS = (
 LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*(\d+)[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
 #: Entries of the section CTPro that count as those of XTekCT.
 CTPRO = ("shuttling", "anglefile_use")
+#: Sections of the tube, of Nikon's own reconstruction and of texts.
+OTHER_SECTIONS = ("[ctpro]", "[xrays]", "[dicom]")
 
 
 class Header(NamedTuple):
@@ -119,14 +121,19 @@ def header(path: str | Path) -> Header:
     path = Path(path)
     check_file(path, "Nikon's .xtekct")
     texts: dict[str, str] = {}
+    others: dict[str, str] = {}
     for section, name, value in section_entries(path):
         own = section == "[xtekct]" or (section == "[ctpro]" and name in CTPRO)
         if own and texts.setdefault(name, value) != value:
             raise Refused(f"{path}: expected one {name}, got {texts[name]} and {value}")
+        if not own and section not in OTHER_SECTIONS:
+            others[f"{section} {name}"] = value
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
-    warn_of_unknown(path, unknown_entries(texts, KEYS))
+    if _angle_files(path):
+        texts.pop("anglefile_use", None)  # they are compared
+    warn_of_unknown(path, [*unknown_entries(texts, KEYS), *unknown_entries(others, ())])
     return Header(path, texts)
 
 
@@ -202,9 +209,14 @@ def read(path: str | Path) -> Cameras:
         return plate.carried(R @ source, R @ centre, looking)
 
 
+def _angle_files(path: str | Path) -> list[Path]:
+    """The lists of measured angles beside a header, .ang or _ctdata.txt."""
+    return sorted([*Path(path).parent.glob("*.ang"), *Path(path).parent.glob("*_ctdata.txt")])
+
+
 def _warn_of_steps(path: str | Path, step: float) -> None:
-    """Warn of a list of measured angles, .ang or _ctdata.txt, in other steps."""
-    for file in sorted([*Path(path).parent.glob("*.ang"), *Path(path).parent.glob("*_ctdata.txt")]):
+    """Warn of a list of measured angles in other steps."""
+    for file in _angle_files(path):
         lines = map(LISTED.match, text_of(file, strict=False).splitlines())
         listed = [[float(line[1]), float(line[2])] for line in lines if line]
         numbers, angles = torch.tensor(listed, dtype=torch.float64).reshape(-1, 2).T
