@@ -20,13 +20,8 @@ from mvrecon.core.parts import METHODS, PROJECTORS, ClassicalPart, MethodPart
 from mvrecon.core.quantities import PositiveInt
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid, subdivided
-from mvrecon.operators.operator import (
-    LinearOperator,
-    Projector,
-    check,
-    check_floating,
-    check_views,
-)
+from mvrecon.operators.checks import check, check_floating, check_views
+from mvrecon.operators.operator import LinearOperator, Projector
 
 
 class CameraPrior(NamedTuple):

@@ -21,15 +21,9 @@ from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays import ops, reference
 from mvrecon.kernels.rays.lines import lines_of, lines_of_rays
 from mvrecon.kernels.rays.occupancy import Occupancy
+from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.memo import FixedGeometry, kept
-from mvrecon.operators.operator import (
-    Cropped,
-    LinearOperator,
-    PixelIntegral,
-    Projector,
-    check,
-    check_floating,
-)
+from mvrecon.operators.operator import Cropped, LinearOperator, PixelIntegral, Projector
 from mvrecon.operators.selection import (
     SKIPS,
     RaySelection,

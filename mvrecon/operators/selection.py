@@ -16,7 +16,8 @@ from torch.nn.functional import avg_pool2d
 from mvrecon.geometry.grid import Box
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.rays.occupancy import Occupancy
-from mvrecon.operators.operator import Derived, LinearOperator, check_floating
+from mvrecon.operators.checks import check_floating
+from mvrecon.operators.operator import Derived, LinearOperator
 
 
 class ViewSelection(LinearOperator):

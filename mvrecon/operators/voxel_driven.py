@@ -15,8 +15,8 @@ from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import centred_affine
 from mvrecon.kernels import voxels
 from mvrecon.kernels.operator import choose_backend, to_accumulation_dtype
+from mvrecon.operators.checks import check
 from mvrecon.operators.memo import grid_key, kept, place
-from mvrecon.operators.operator import check
 
 Weight = Literal["none", "distance"]
 

@@ -9,7 +9,7 @@ import torch
 from mvrecon.core.parts import PROJECTORS
 from mvrecon.geometry.cameras.camera import VECTORS
 from mvrecon.kernels.rays.lines import lines_of
-from mvrecon.operators.operator import check_views
+from mvrecon.operators.checks import check_views
 from mvrecon.operators.selection import view_subset
 from tests.operators.cases import curved
 from tests.operators.rigs import CONE, GRID, PARALLEL

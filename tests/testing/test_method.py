@@ -7,7 +7,7 @@ from torch import nn
 from mvrecon.core.parts import HEADS, METHODS, WEIGHTINGS
 from mvrecon.methods.learned.view_frames import Frusta
 from mvrecon.methods.method import Reconstruction
-from mvrecon.operators.operator import check_views
+from mvrecon.operators.checks import check_views
 from mvrecon.testing import check_head, check_method, check_weighting
 from tests.methods.learned.rig import small_projector, small_rig
 

@@ -118,21 +118,8 @@ OF_DISPLAY = re.compile(
 )
 OTHER_UNITS = {
     *MILLIMETRES,
-    *(
-        "count",
-        "counts",
-        "adu",
-        "dn",
-        "pixel",
-        "pixels",
-        "px",
-        "inch",
-        "in",
-        "s",
-        "sec",
-        "ms",
-        "us",
-    ),
+    *("count", "counts", "adu", "dn", "pixel", "pixels", "px", "inch", "in"),
+    *("s", "sec", "ms", "us"),
     *("deg", "degrees", "rad"),
     *("v", "kv", "kev", "ev", "ma", "ua", "a", "w", "c", "k", "bit", "bits"),
 }

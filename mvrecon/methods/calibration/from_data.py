@@ -34,7 +34,8 @@ from mvrecon.geometry.cameras.random_rigs import Misalignment, misaligned
 from mvrecon.methods.calibration.alignment import Blur, RootRamp, blurred, least_deviations
 from mvrecon.methods.classical.least_squares import cgls
 from mvrecon.methods.classical.truncation import cut_sides, truncated_slices
-from mvrecon.operators.operator import LinearOperator, Projector, Scaled, Symmetric, check_finite
+from mvrecon.operators.checks import check_finite
+from mvrecon.operators.operator import LinearOperator, Projector, Scaled, Symmetric
 
 
 class Kind(NamedTuple):

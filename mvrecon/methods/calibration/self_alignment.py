@@ -40,8 +40,9 @@ from mvrecon.methods.classical.truncation import (
 )
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
+from mvrecon.operators.checks import check_finite, check_views
 from mvrecon.operators.memo import grid_key, kept, place
-from mvrecon.operators.operator import LinearOperator, Projector, check_finite, check_views
+from mvrecon.operators.operator import LinearOperator, Projector
 from mvrecon.operators.selection import view_subset
 
 #: Shifts in pixels, and gains, below which a camera counts as error-free.

@@ -30,14 +30,9 @@ from mvrecon.methods.classical.truncation import (
     truncated,
     warn_of_truncation,
 )
+from mvrecon.operators.checks import check_floating, check_measured, check_views
 from mvrecon.operators.memo import grid_key, kept, place
-from mvrecon.operators.operator import (
-    Projector,
-    Scaled,
-    check_floating,
-    check_measured,
-    check_views,
-)
+from mvrecon.operators.operator import Projector, Scaled
 from mvrecon.operators.voxel_driven import (
     Images,
     add_backprojection,

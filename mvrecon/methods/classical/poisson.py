@@ -8,7 +8,8 @@ from torch import Tensor
 
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.methods.classical.solver import spread_background
-from mvrecon.operators.operator import LinearOperator, check_measured
+from mvrecon.operators.checks import check_measured
+from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import RaySelection, ViewSelection
 
 #: Share of bins with counts up to which a list of rays is faster than whole views, for all rigs and

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from mvrecon.core.registry import hint
 from mvrecon.kernels.operator import to_accumulation_dtype
-from mvrecon.operators.operator import LinearOperator, check, check_finite, check_measured
+from mvrecon.operators.checks import check, check_finite, check_measured
+from mvrecon.operators.operator import LinearOperator
 from mvrecon.operators.selection import check_support
 
 P = ParamSpec("P")

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Box
 from mvrecon.methods.classical.solver import Iterate, Monitor
-from mvrecon.operators.operator import LinearOperator, Projector, check_finite
+from mvrecon.operators.checks import check_finite
+from mvrecon.operators.operator import LinearOperator, Projector
 
 
 def discrepancy(sigma: float | Float[Tensor, "#b #c #m #v #u"]) -> Monitor:

@@ -12,8 +12,9 @@ from torch import Tensor
 
 from mvrecon.core.numbers import divided
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt_weights
+from mvrecon.operators.checks import check_finite, check_floating, check_measured
 from mvrecon.operators.memo import kept
-from mvrecon.operators.operator import Projector, check_finite, check_floating, check_measured
+from mvrecon.operators.operator import Projector
 from mvrecon.operators.visual_hull.support import ViewNoise, support_masks
 
 #: Chords are clamped to at least this part of the longest.

@@ -14,8 +14,8 @@ from mvrecon.geometry.grid import Grid, bricks_along
 from mvrecon.kernels import self_test
 from mvrecon.kernels.cuda import bricks
 from mvrecon.kernels.cuda.bricks import Prints, Rule
+from mvrecon.operators.checks import check_finite
 from mvrecon.operators.memo import grid_key, kept, place
-from mvrecon.operators.operator import check_finite
 from mvrecon.operators.visual_hull import footprints
 
 #: Views per pass, of all items of a batch; bricks proved empty are skipped in the next pass.

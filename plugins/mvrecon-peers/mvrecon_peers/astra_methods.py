@@ -10,7 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.methods.classical.solver import check_no_gradient
-from mvrecon.operators.operator import Projector, check_views
+from mvrecon.operators.checks import check_views
+from mvrecon.operators.operator import Projector
 from mvrecon_peers.astra import Astra
 
 

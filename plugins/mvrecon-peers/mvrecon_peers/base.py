@@ -18,8 +18,8 @@ from torch.autograd.forward_ad import make_dual, unpack_dual
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.kernels.operator import to_accumulation_dtype
+from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.memo import FixedGeometry
-from mvrecon.operators.operator import check, check_floating
 from mvrecon_peers.frame import framed, near, wants_gradient
 from mvrecon_peers.operator import known_by, linear
 

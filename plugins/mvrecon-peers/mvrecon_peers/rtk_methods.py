@@ -12,7 +12,8 @@ from torch import Tensor
 
 from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.solver import check_no_gradient
-from mvrecon.operators.operator import Projector, check_views
+from mvrecon.operators.checks import check_views
+from mvrecon.operators.operator import Projector
 from mvrecon_peers.rtk import Rtk
 
 #: RTK's enumerators of its Joseph filters, forward and back.

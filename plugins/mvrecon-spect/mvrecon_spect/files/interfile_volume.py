@@ -12,7 +12,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.geometry.cameras.formats.common import to_ras
 from mvrecon.geometry.grid import Grid
-from mvrecon.operators.operator import check_floating
+from mvrecon.operators.checks import check_floating
 from mvrecon_spect.files.interfile import (
     Header,
     check_repeated,

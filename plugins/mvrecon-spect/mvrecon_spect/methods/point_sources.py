@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
-from mvrecon.operators.operator import check_floating
+from mvrecon.operators.checks import check_floating
 from mvrecon_spect.kernels import reference
 from mvrecon_spect.operators.hole import Hole
 from mvrecon_spect.operators.response import FWHM, TABLE, record_of

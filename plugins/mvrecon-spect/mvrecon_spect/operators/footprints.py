@@ -27,16 +27,9 @@ from mvrecon.geometry.cameras.rigs import dcspect80
 from mvrecon.geometry.grid import Box, Grid
 from mvrecon.kernels.operator import accumulation_dtype, choose_backend, to_accumulation_dtype
 from mvrecon.kernels.self_test import Errors
+from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.memo import FixedGeometry, grid_key, kept
-from mvrecon.operators.operator import (
-    Cropped,
-    LinearOperator,
-    PixelIntegral,
-    Projector,
-    Scaled,
-    check,
-    check_floating,
-)
+from mvrecon.operators.operator import Cropped, LinearOperator, PixelIntegral, Projector, Scaled
 from mvrecon.operators.selection import ViewSelection
 from mvrecon_spect.kernels import ops, reference
 from mvrecon_spect.operators.hole import Hole
