@@ -146,19 +146,22 @@ def from_astra(
         extent: which part of a ray counts; by default "segment", and "line" for parallel beams.
         flip_rows: reverse the detector's rows; the views' rows must be reversed with them.
 
-    Convention: ASTRA's own circular geometries have v upwards (left-handed here): they need
-    `flip_rows`.
+    Convention: ASTRA's own circular geometries have v upwards: cone beams are left-handed here and
+    need `flip_rows`. Its parallel rays run from the detector to the source of its cone beams, and a
+    whole line has no direction: they get the one by which the camera is right-handed.
 
     Raises:
         ValueError: wrong shapes, values not finite, left-handed cameras.
     """
     first, centre, u, v = _checked("ASTRA vectors", vectors, 12).split(3, dim=-1)
+    extent = extent or ("line" if parallel else "segment")
     v = -v if flip_rows else v
+    if parallel and extent == "line":
+        turned = torch.linalg.det(torch.stack([u, v, first], dim=-1)) < 0
+        first = torch.where(turned[:, None], -first, first)
     origin = centre - u * (shape[1] - 1) / 2 - v * (shape[0] - 1) / 2
     source = origin - first if parallel else first
-    return Cameras(
-        source, origin, u, v, shape, parallel, extent or ("line" if parallel else "segment")
-    )
+    return Cameras(source, origin, u, v, shape, parallel, extent)
 
 
 def to_kornia(cameras: Cameras) -> KorniaCameras:

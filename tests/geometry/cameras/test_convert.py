@@ -123,6 +123,26 @@ def test_the_circle_of_astra_is_ours_with_rows_reversed():
     assert same(convert.from_astra(rows, (6, 9), flip_rows=True), ours)
 
 
+@pytest.mark.parametrize("flip_rows", [False, True])
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, -1, -1), (1, -1, 1)])
+def test_parallel_lines_of_astra_have_no_direction(signs, flip_rows):
+    """ASTRA's parallel3d geometry has rays (sin a, -cos a), against those of its cone beams: pixel
+    (i, j) measures the line through centre + u (j - 4) + v (i - 2.5), whichever way it runs.
+    """
+    angles = torch.deg2rad(torch.tensor([0.0, 30.0, 200.0], dtype=torch.float64))
+    c, s, zero = angles.cos(), angles.sin(), torch.zeros(3, dtype=torch.float64)
+    ray, u = torch.stack([s, -c, zero], dim=1), torch.stack([3 * c, 3 * s, zero], dim=1)
+    v = torch.tensor([[0, 0, 2.0]], dtype=torch.float64).repeat(3, 1)
+    signed = ray * torch.tensor(signs, dtype=torch.float64)[:, None]
+    rows = torch.cat([signed, 0 * u, u, v], dim=1)
+    rig = convert.from_astra(rows, (6, 9), parallel=True, flip_rows=flip_rows)
+    i, j = (4, 1)
+    point = u * (j - 4) + v * (i - 2.5)
+    uv = rig.project(point + 50 * ray)[torch.arange(3), torch.arange(3), :2]
+    expected = torch.tensor([j, 5 - i if flip_rows else i], dtype=torch.float64)
+    assert torch.allclose(uv, expected.expand(3, 2), atol=1e-9)
+
+
 @pytest.mark.parametrize("extent", ["ahead", "behind"])
 def test_kornia_projects_and_unprojects_as_the_record_does(extent):
     from kornia.geometry.camera import PinholeCamera, project_points

@@ -215,3 +215,15 @@ def test_astra_writes_its_circular_geometry_in_this_form(tmp_path):
     assert same(astra.read(tmp_path / "rig.npy", [6, 9]), expected, 1e-9)
     with pytest.raises(Refused, match="left-handed.*flip_rows=false"):
         astra.read(tmp_path / "rig.npy", [6, 9], flip_rows=False)
+
+
+def test_astra_writes_its_parallel_geometry_in_this_form(tmp_path):
+    """ASTRA's parallel geometry as vectors is read with the options of its cone geometry."""
+    library = pytest.importorskip("astra")
+    turned = np.radians([0.0, 30.0, 100.0])
+    beams = library.create_proj_geom("parallel3d", 3.0, 2.0, 6, 9, turned)
+    np.save(tmp_path / "rig.npy", library.geom_2vec(beams)["Vectors"])
+    rig = astra.read(tmp_path / "rig.npy", [6, 9], parallel=True)
+    assert (rig.v[:, 2] == -2).all()  # downwards: the rows of the views are reversed
+    across = 3 * np.stack([np.cos(turned), np.sin(turned)], axis=1)
+    np.testing.assert_allclose(rig.u[:, :2].numpy(), across, atol=1e-12)

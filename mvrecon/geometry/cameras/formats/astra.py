@@ -28,7 +28,7 @@ def read(
     Args:
         path: text, twelve numbers per line, or a .npy of [views 12].
         pixels: rows and columns of the detector.
-        parallel: "parallel3d_vec": the first three numbers are the ray's direction.
+        parallel: "parallel3d_vec": the first three numbers are the ray's direction, of either sign.
         unit_mm: length of ASTRA's unit in mm.
         world: axes of the file, "RAS", "LPS" or "IEC"; see `to_ras`.
         flip_rows: v runs upwards, as in ASTRA's own circular geometries; the rows of the views must
@@ -41,7 +41,7 @@ def read(
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: an invalid file, non-finite values, left-handed cameras: v runs the other way
+        ValueError: an invalid file, non-finite values, left-handed cone beams: v runs the other way
             than `flip_rows` states, or options that contradict the first line that `write` wrote.
     """
     shape = Detector(pixels, 1.0).pixels  # type: ignore[arg-type]
