@@ -60,8 +60,9 @@ def one_line(app: str) -> Iterator[None]:
     the first one is printed, and at the end how many followed.
 
     SIGTERM, and SIGHUP of a terminal that closes, end the process as Ctrl-C does: files that are
-    not complete are removed, and the status is 128 plus the number of the signal. Python ignores
-    the error of a signal that arrives while an object is freed; it is raised again.
+    not complete are removed, and the status is 128 plus the number of the signal; a training, in
+    which Lightning handles SIGTERM, ends as of that after SIGHUP, too. Python ignores the error of
+    a signal that arrives while an object is freed; it is raised again.
 
     Args:
         app: name of the app, with which the line begins.
@@ -113,10 +114,18 @@ def one_line(app: str) -> Iterator[None]:
 
 @contextmanager
 def _handled(terminate: Callable[[int, Any], None]) -> Iterator[None]:
-    """Context in which SIGTERM has a handler and SIGHUP is a SIGTERM, unless they are handled or
-    ignored already, as by nohup.
+    """Context in which SIGTERM has a handler, and SIGHUP whichever handler SIGTERM has when it
+    arrives, as that of a training, unless they are handled or ignored already, as by nohup.
     """
-    handlers = {"SIGTERM": terminate, "SIGHUP": lambda *_: signal.raise_signal(signal.SIGTERM)}
+
+    def hang_up(number: int, frame: Any) -> None:
+        handler = signal.getsignal(signal.SIGTERM)
+        if callable(handler):
+            handler(number, frame)
+        else:
+            signal.raise_signal(signal.SIGTERM)
+
+    handlers = {"SIGTERM": terminate, "SIGHUP": hang_up}
     main = threading.current_thread() is threading.main_thread()  # no other may set handlers
     before = {
         number: signal.signal(number, handler)
