@@ -212,17 +212,24 @@ def _of_counts(view: Float[Tensor, "1 v u"]) -> list[str]:
 
 
 def _of_lost_views(scan: Scan, numbers: list[int]) -> list[str]:
-    """Check for views that are zero everywhere, as columns of a sinogram beside the object are."""
+    """Check for views that are zero everywhere, as columns of a sinogram beside the object are, or
+    slices above and below it.
+    """
     if not numbers:
         return []
-    measured, last = scan.measured, len(scan.cameras) - 1
+    measured, count = scan.measured, len(scan.cameras)
     sinogram = isinstance(measured, MeasuredViews) and measured.options.layout == "sinogram"
-    exchanged = sinogram and numbers[0] == 0 and numbers[-1] == last
-    ask = "are the sinogram's angles its columns? Expected its rows; else " if exchanged else ""
-    return [
-        f"lost views, zero everywhere: {', '.join(map(str, numbers))} (from 0); {ask}correct=align "
-        f"replaces them by the volume's"
-    ]
+    remedies = []
+    if numbers[0] == 0 and numbers[-1] == count - 1:
+        remedies += [
+            "are the sinogram's angles its columns? Expected its rows"
+            if sinogram
+            else "are they slices of a sinogram (views.layout=sinogram)?"
+        ]
+    if len(numbers) <= count // 2:
+        remedies += ["correct=align replaces them by the volume's"]
+    found = f"lost views, zero everywhere: {', '.join(map(str, numbers))} (from 0)"
+    return ["; ".join([found, *remedies])]
 
 
 def _of_hot_voxels(volume: Float[Tensor, "d h w"]) -> list[str]:

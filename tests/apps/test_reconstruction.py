@@ -322,16 +322,22 @@ def test_a_run_that_would_write_to_its_own_rig_is_refused(scan, tmp_path, name, 
     assert rig.read_bytes() == before
 
 
-@pytest.mark.parametrize("place", ["file/volume.nii.gz", "folder.nii.gz"])
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("file/volume.nii.gz", "file: expected a folder, got a file"),
+        ("folder.nii.gz", "folder.nii.gz: expected a file, got a folder"),
+    ],
+)
 def test_a_place_that_cannot_be_written_is_refused_first(
-    scan, tmp_path, place, monkeypatch, capsys
+    scan, tmp_path, place, message, monkeypatch, capsys
 ):
     """A volume that cannot be written is refused before any view is read."""
     (tmp_path / "file").touch()
     (tmp_path / "folder.nii.gz").mkdir()
     monkeypatch.setattr("mvrecon.apps.scan.open_scan", lambda *_: pytest.fail("views are read"))
     assert run(scan, tmp_path / "run", f"out={tmp_path / place}") == 1
-    assert f"{tmp_path / place}: expected" in capsys.readouterr().err
+    assert f"{tmp_path / message}" in capsys.readouterr().err
 
 
 def test_the_endings_that_the_settings_list_for_a_volume_are_written():

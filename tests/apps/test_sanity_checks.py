@@ -394,6 +394,18 @@ def test_lengths_in_metres_and_lost_views_are_detected(views, right_rig):
     assert "lost views" in both[0] and "does not reproduce the views" in both[1]
 
 
+def test_views_that_may_be_slices_of_a_sinogram_are_asked_about(views, right_rig):
+    """Zero at both ends, as slices above and below an object; alignment replaces at most half."""
+    last = len(views) - 1
+    few, many = ([*range(n), *range(last - n + 1, last + 1)] for n in (1, last // 4 + 2))
+    (words,) = checked(scan_of(views), "fdk", 0.05, lost=few)
+    assert "views.layout=sinogram" in words and "correct=align" in words
+    (words,) = checked(scan_of(views), "fdk", 0.05, lost=many)
+    assert "views.layout=sinogram" in words and "correct=align" not in words
+    (words,) = checked(scan_of(views), "fdk", 0.05, lost=[0, 1])
+    assert "views.layout=sinogram" not in words
+
+
 def head(rig, offset):
     """The scan, with noise, of a phantom in closed form, whose detector is `offset` pixels aside
     its place in the rig.

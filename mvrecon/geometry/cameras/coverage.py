@@ -245,7 +245,7 @@ def _rounded_up(value: float) -> float:
 def check_coverage(
     cameras: Cameras,
     grid: Grid,
-    remedy: str = "camera.detector.pixels=fit or camera.detector.pixel_mm=fit chooses it",
+    remedy: str | None = None,
     bodies: Sequence[Float[Tensor, "d h w"]] = (),
 ) -> None:
     """Warn of a rig that sees little of the grid, or of the bodies in it.
@@ -256,7 +256,7 @@ def check_coverage(
     Args:
         cameras: the rig.
         grid: the voxels.
-        remedy: advice that ends the warning where some detector sees the grid.
+        remedy: advice that ends the warning; None: how to choose the detector, if there is one.
         bodies: true volumes of the first cases.
 
     Warns:
@@ -305,22 +305,22 @@ def _warn_of_rays_aside(cameras: Cameras, grid: Grid) -> None:
             )
 
 
-def _advice(cameras: Cameras, grid: Grid, remedy: str) -> str:
-    """The detector that sees the grid's inscribed cylinder, in words, and a remedy; or that none
-    does.
+def _advice(cameras: Cameras, grid: Grid, remedy: str | None) -> str:
+    """The detector that sees the grid's inscribed cylinder, in words, or that none does; and a
+    remedy.
     """
     rows, columns = cameras.shape
     try:
         v, u = covering_pixels(cameras, grid)
     except ValueError as error:
-        return str(error)
+        return f"{error}; {remedy}" if remedy else str(error)
     factor = max(v / rows, u / columns)
     pitch = [step.norm(dim=-1).median().item() for step in (cameras.v, cameras.u)]
     mm = " x ".join(f"{_rounded_up(factor * step):g}" for step in pitch)
     return (
         f"Its inscribed cylinder needs a detector of {math.ceil(v)} x {math.ceil(u)} pixels (rows "
         f"x columns) at this pitch, or {rows} x {columns} pixels of {mm} mm; "
-        f"{remedy}"
+        + (remedy or "camera.detector.pixels=fit or camera.detector.pixel_mm=fit chooses it")
     )
 
 
