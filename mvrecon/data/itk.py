@@ -15,7 +15,8 @@ from torch import Tensor
 
 from mvrecon.core.files import checks
 from mvrecon.core.files.atomic import written_whole
-from mvrecon.data.itk_headers import HEADER, check_even, check_length, meta_header, nrrd_header
+from mvrecon.data.itk_headers import HEADER, check_even, check_length, meta_header
+from mvrecon.data.nrrd_header import nrrd_header
 from mvrecon.data.resample import Slabs, oriented, planes, right_angled, storable
 from mvrecon.geometry.grid import Grid
 

@@ -1,4 +1,6 @@
-"""Headers of MetaImage (MHA, MHD) and NRRD, checked before ITK reads the values."""
+"""Headers of MetaImage (MHA, MHD), checked before ITK reads the values, and what they share with
+those of NRRD (`nrrd_header`).
+"""
 
 import math
 import re
@@ -11,13 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.core.files import checks
-from mvrecon.core.files.keys import EFFECTS, Key, check_keys, check_unknown, warn_of_unknown
+from mvrecon.core.files.keys import EFFECTS, Key, check_keys, check_unknown
 
 #: Maximum bytes of a header.
 HEADER = 2**16
-#: Maximum characters of a line of an NRRD header, except comments and key/value pairs: ITK
-#: overflows a buffer at 1000, which ends the process (SimpleITK 2.5.7; 500 are safe).
-LINE = 500
 #: What C takes for blanks.
 BLANKS = " \t\n\r\v\f"
 #: Lengths are mm, which ITK takes all to be: NRRD's and MetaImage's unknown units.
@@ -132,50 +131,6 @@ META_TYPES = {
 MIN_SIDE_COSINE = 0.25
 #: The truth by the first letters that ITK accepts.
 TRUTH = {"true": True, "t": True, "1": True, "false": False, "f": False, "0": False}
-#: Fields of NRRD, all applied by ITK but where noted. A key/value pair (key:=value) is no field.
-NRRD_KEYS = (
-    Key("dimension, sizes", "applied", "three axes; further ones of one voxel are dropped"),
-    Key("type, endian", "applied"),
-    Key("encoding", "refused", "", ("raw", "gzip", "gz", "hex", "ascii", "text", "txt")),
-    Key("byte skip, line skip", "applied"),
-    Key("space directions", "applied", "three vectors"),
-    Key("space origin", "applied"),
-    Key("spacings", "applied", "where there are no space directions"),
-    Key(
-        "space",
-        "refused",
-        "ITK takes other spaces for left-posterior-superior",
-        (
-            *("left-posterior-superior", "right-anterior-superior", "left-anterior-superior"),
-            *("LPS", "RAS", "LAS", "3D-right-handed", "3DR"),
-        ),
-    ),
-    Key("space dimension", "refused", "taken for left-posterior-superior, as by ITK", (2, 3, 4)),
-    Key("space units, units", "applied", "by mvrecon, to mm"),
-    Key(
-        "sample units",
-        "refused",
-        "convert the values",
-        ("HU", "hounsfield", "hounsfield units", "1/mm", "mm^-1", "counts", "activity", "unknown"),
-    ),
-    Key("axis mins", "applied", "beside spacings, by centerings"),
-    Key("axis maxs", "refused", "state the voxel size as space directions", ("nan",)),
-    Key("old min", "refused", "store the values before they were quantized", ("nan",)),
-    Key("old max", "refused", "store the values before they were quantized", ("nan",)),
-    Key(
-        "centerings, centers",
-        "applied",
-        "of axis mins: node, or else half a voxel before its centre",
-    ),
-    Key("kinds", "compared", "an axis of time is refused unless of one voxel: it has no length"),
-    Key("data file", "refused", "its values in the same file"),
-    Key("measurement frame", "ignored", "of vectors"),
-    Key("number, content, labels", "ignored", "repeated by sizes, and texts"),
-    Key("min, max, thicknesses", "ignored", "statistics, and extent of a voxel"),
-    *COPIED,
-)
-#: All fields of NRRD without blanks, which ITK's reader accepts as well.
-FIELDS = {name.replace(" ", "") for key in NRRD_KEYS if key not in COPIED for name in key.names}
 
 
 class Header(NamedTuple):
@@ -239,7 +194,7 @@ def meta_header(path: Path, text: str) -> Header:
         raise checks.Refused(
             f"{path}: expected a CompressedDataSize, got none: ITK would leave values undefined"
         )
-    mm = _millimetres(path, [entries.get("DistanceUnits", "")], "DistanceUnits")
+    mm = unit_of_length(path, [entries.get("DistanceUnits", "")], "DistanceUnits")
     size = None if stated is None else int(stated[0])
     encoding, uneven = "gzip" if packed else "raw", entries.get(UNEVEN, "0")
     return Header(data, start, encoding, min(0, skipped), mm, size, uneven)
@@ -296,7 +251,7 @@ def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
     for name, power in COUNTS.items():
         if name not in entries:
             continue
-        count, found = int(axes) ** power, _finite(entries[name].split())
+        count, found = int(axes) ** power, finite(entries[name].split())
         if len(found) != count or len(entries[name].split()) != count:
             raise checks.Refused(
                 f"{path}: expected {count} finite numbers for {name}, got "
@@ -309,7 +264,7 @@ def _counted(path: Path, entries: Mapping[str, str]) -> dict[str, list[float]]:
     return numbers
 
 
-def _finite(words: Sequence[str]) -> list[float]:
+def finite(words: Sequence[str]) -> list[float]:
     """The finite numbers among words, as both C and Python read them."""
     plain = [float(w) for w in words if re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", w)]
     return [value for value in plain if math.isfinite(value)]
@@ -393,7 +348,7 @@ def check_length(path: Path, header: Header, needed: int, itemsize: int) -> None
 
 def check_even(path: Path, header: Header, spacing_mm: float) -> None:
     """Raise for an image that ITK joined of slices at other distances than its spacing."""
-    uneven = _finite([header.uneven])
+    uneven = finite([header.uneven])
     if not uneven or uneven[0] * header.mm > GAP * spacing_mm:
         raise checks.Refused(
             f"{path}: expected slices {spacing_mm:g} mm apart, got {UNEVEN} "
@@ -418,109 +373,7 @@ def _inflated(header: Header, most: int) -> tuple[int, int]:
     return used - len(stream.unused_data), count
 
 
-def nrrd_header(path: Path, text: str) -> Header:
-    entries, first = _nrrd_entries(path, text)
-    check_keys(path, NRRD_KEYS, lambda key: _word(entries, key))
-    _check_places(path, entries)
-    kinds, sizes = (entries.get(name, "").lower().split() for name in ("kinds", "sizes"))
-    if any(kind == "time" and size != "1" for kind, size in zip(kinds, sizes, strict=False)):
-        raise checks.Refused(f"{path}: expected kinds of lengths, got {entries['kinds']}")
-    lines, skip = (_whole(path, entries, name, 0) for name in ("line skip", "byte skip"))
-    raw, encoding = text.encode("latin-1"), entries.get("encoding", "raw").lower()
-    if lines < 0 or skip < (-1 if encoding == "raw" else 0):
-        raise checks.Refused(
-            f"{path}: expected a line skip and byte skip from 0 (or -1, of raw values), got "
-            f"{lines} and {skip}"
-        )
-    for _ in range(lines):
-        first = raw.find(b"\n", first) + 1
-        if first == 0:
-            raise checks.Refused(f"{path}: expected {lines} lines to skip, got fewer")
-    units = [entries.get(name, "") for name in ("units", "spaceunits")]
-    quoted = [unit for text in units for unit in re.findall(r'"([^"]*)"', text)]
-    mm = _millimetres(path, quoted or [""], "units and space units")
-    names = {"raw": "raw", "gz": "gzip", "gzip": "gzip", "hex": "hex"}
-    uneven = entries.get(UNEVEN, "0")
-    return Header(path, first, names.get(encoding, "text"), skip, mm, uneven=uneven)
-
-
-def _word(entries: Mapping[str, str], key: str) -> str:
-    """The text of a field, without quotation marks."""
-    return entries.get(key.replace(" ", ""), "").strip('"')
-
-
-def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
-    """Fields and texts of an NRRD header up to an empty line, as ITK's C reader splits it (Python's
-    `splitlines` also splits at other characters), and the bytes of the header.
-    """
-    lines = [line.removesuffix("\r") for line in text.split("\n")]
-    if not lines[0].startswith("NRRD") or "" not in lines:
-        raise checks.Refused(f"{path}: expected an NRRD header of at most {HEADER} bytes")
-    count = lines.index("")
-    entries: dict[str, str] = {}
-    pairs: list[tuple[str, str]] = []
-    for line in lines[1:count]:
-        name, between, value = line.partition(": ")
-        name = name.lower().replace(" ", "")
-        free = line.startswith("#") or (":=" in line and ": " not in line)
-        if len(line) > LINE and not free:
-            raise checks.Refused(
-                f"{path}: expected lines of at most {LINE} characters in its header, got "
-                f"{checks.shown(line)}"
-            )
-        if between and name in FIELDS:  # ITK refuses unknown and repeated ones
-            entries.setdefault(name, value.strip())
-        elif ":=" in line and not line.startswith("#"):
-            pairs.append((line.partition(":=")[0], line.partition(":=")[2]))
-    alike = [pair for pair in pairs if pair[0].lower().replace(" ", "") in FIELDS]
-    warn_of_unknown(path, [f"{name}:=" for name, _ in alike])  # no fields, whatever their names
-    check_unknown(path, [pair for pair in pairs if pair not in alike], NRRD_KEYS, META_EFFECTS)
-    entries |= {name: value.strip() for name, value in pairs if name == UNEVEN}
-    return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
-
-
-def _whole(path: Path, entries: Mapping[str, str], key: str, default: int) -> int:
-    """The whole number of an NRRD's field, as both C and Python read it."""
-    text = entries.get(key.replace(" ", ""), str(default))
-    if not re.fullmatch("[+-]?[0-9]{1,15}", text):
-        raise checks.Refused(f"{path}: expected a whole number as {key}, got {checks.shown(text)}")
-    return int(text)
-
-
-def _check_places(path: Path, entries: Mapping[str, str]) -> None:
-    """Check the numbers of an NRRD's places: ITK ignores those that are not finite."""
-    directions, spacings = entries.get("spacedirections"), entries.get("spacings", "")
-    axes = int(entries.get("spacedimension", 3))  # one of those in NRRD_KEYS
-    count = _whole(path, entries, "dimension", 3)
-    for name, text, vectors in (
-        ("space directions", directions, axes),
-        ("space origin", entries.get("spaceorigin"), 1),
-    ):
-        found = re.findall(r"\(([^()]*)\)", text or "")
-        rest = re.sub(r"\([^()]*\)|\bnone\b", "", text or "").strip()
-        sizes = [len(_finite([n.strip() for n in vector.split(",")])) for vector in found]
-        if text is not None and (sizes != [axes] * vectors or rest):
-            raise checks.Refused(
-                f"{path}: expected {name} of {vectors} vectors of {axes} finite numbers, got "
-                f"{checks.shown(text)}"
-            )
-    expected = 0 if directions is not None else min(3, count)
-    found = [value for value in _finite(spacings.split()) if value]
-    words = [word for word in spacings.lower().split() if word != "nan"]
-    if spacings and (len(found) != expected or len(words) != expected):
-        raise checks.Refused(
-            f"{path}: expected {expected or 'no'} finite spacings"
-            f"{' beside space directions' if directions else ''}, got {checks.shown(spacings)}"
-        )
-    mins = [word for word in entries.get("axismins", "").lower().split() if word != "nan"]
-    if mins and not len(_finite(mins)) == len(mins) == len(found):
-        raise checks.Refused(
-            f"{path}: expected axis mins of 3 finite numbers beside spacings, got "
-            f"{checks.shown(entries['axismins'])}; state the first voxel's place as space origin"
-        )
-
-
-def _millimetres(path: Path, texts: Sequence[str], names: str) -> float:
+def unit_of_length(path: Path, texts: Sequence[str], names: str) -> float:
     """Unit of length of a header in mm."""
     where = f"{path}: {names}"
     mm = {1.0 if text in NO_UNIT else checks.millimetres(where, text) for text in texts}

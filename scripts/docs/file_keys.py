@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvrecon.core.files.keys import Key
-from mvrecon.data import dicom, dicom_image, itk_headers, linked, nifti, vgi
+from mvrecon.data import dicom, dicom_image, itk_headers, linked, nifti, nrrd_header, vgi
 from mvrecon.data.projections import dicom_views, nexus, png, rtk_images, tiff
 from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
 from mvrecon_spect.files import interfile_keys, nm_keys, nm_volume
@@ -23,7 +23,7 @@ TABLE = re.compile(
 FORMATS: dict[str, Sequence[Key]] = {
     "NIfTI": nifti.KEYS,
     "MetaImage": itk_headers.META_KEYS,
-    "NRRD": itk_headers.NRRD_KEYS,
+    "NRRD": nrrd_header.NRRD_KEYS,
     "VGStudio's .vgi": vgi.KEYS,
     "DICOM": dicom_image.KEYS,
     "DICOM CT": dicom.CT_KEYS,

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.data import itk_headers
+from mvrecon.data import itk_headers, nrrd_header
 from mvrecon.data.volume_files import read_volume
 
 VALUES = np.arange(24, dtype="f4").reshape(2, 3, 4)  # [z y x]
@@ -145,7 +145,7 @@ def test_every_key_of_metaimage_to_refuse_is_refused_by_name(key, tmp_path):
         read_volume(meta(tmp_path / "a.mha", **{key: OTHER[key]}))
 
 
-@pytest.mark.parametrize("key", [k.name for k in itk_headers.NRRD_KEYS if k.use == "refused"])
+@pytest.mark.parametrize("key", [k.name for k in nrrd_header.NRRD_KEYS if k.use == "refused"])
 @pytest.mark.parametrize("blank", [" ", ""])
 def test_every_key_of_nrrd_to_refuse_is_refused_by_name(blank, key, tmp_path):
     """A NRRD with a key that changes values or places, which ITK ignores, is refused."""
