@@ -29,7 +29,7 @@ longer as (
   select avg(a.psnr - b.psnr) as lead from [experiments/29_ray_weights/aligned.csv] a join [experiments/29_ray_weights/aligned.csv] b on b.[case] = a.[case] and b.seed = a.seed where a.method = 'cross_view from robust_sirt, narrow' and b.method = 'world_unet from robust_sirt, narrow' group by a.[case] having count(*) = 3
 ),
 equal as (
-  select a.psnr - b.psnr as lead from [experiments/29_ray_weights/aligned.csv] a join [experiments/29_ray_weights/equal_time_aligned.csv] b on b.[case] = a.[case] and b.seed = a.seed where a.method = 'cross_view from robust_sirt, narrow'
+  select avg(a.psnr - b.psnr) as lead from [experiments/29_ray_weights/aligned.csv] a join [experiments/29_ray_weights/equal_time_aligned.csv] b on b.[case] = a.[case] and b.seed = a.seed where a.method = 'cross_view from robust_sirt, narrow' group by a.[case] having count(*) = 3
 ),
 starts as (
   select views, avg(seconds) as seconds, count(*) as count, sum(degrees < 1 and mm < 1) as found
@@ -48,7 +48,7 @@ select
     (select avg(psnr) from measured where method = 'cross_view, reweight=12' and seed = 0 and steps = 1000)
     - (select avg(psnr) from measured where method = 'world_unet' and steps = 4400)),
   (select printf('cross-view leads by %.1f +- %.1f dB (three seeds', avg(lead), 2 * stdev(lead) / sqrt(count(lead))) from longer),
-  (select printf('%.1f +- %.1f dB at equal time (one seed', avg(lead), 2 * stdev(lead) / sqrt(count(lead))) from equal having count(*) = 33),
+  (select printf('%.1f +- %.1f dB at equal time', avg(lead), 2 * stdev(lead) / sqrt(count(lead))) from equal having count(*) = 33),
   (select printf('leads by %.2f +- %.2f dB', avg(lead), 2 * stdev(lead) / sqrt(count(lead))) from patients),
   (select printf('cross-view %+.2f +- %.2f dB, but a larger error in the heart', avg(lead), 2 * stdev(lead) / sqrt(count(lead)))
     from spect having avg(heart) > 0)
