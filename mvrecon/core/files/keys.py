@@ -40,7 +40,7 @@ class Key(NamedTuple):
 #: Words of unknown keys that change values, units or the order of values, and the value of such a
 #: key, or the values, that change nothing.
 EFFECTS = {
-    "(?<!gr[ae]y)scal(e|ing)(?!_?(types?|bar))|slope|factor|(?<!a)gain|multipl(?!ex)|exponent|"
+    "(?<!gr[ae]y)scal(e|ing)(?!_?(types?|bar))|slope|factor|(?<!\\ba)gain|multipl(?!ex)|exponent|"
     "conversion(?!.?(soft|script|prog))|coefficient": 1,
     "offset|intercept|bias|skip": 0,
     "fill|missing|valid(?!at)|nodata": math.nan,
@@ -57,7 +57,7 @@ IMAGE_EFFECTS = {
     "(?<![a-z])log(?=.?(appl|conv|corr|data|imag|intens|scal|transf))|fft|"
     "background(?!.?colou?r)|black.?level|pedestal|bit.?shift": 0,
     "gamma(?!.?ray)": 1,
-    "(?<!a)gain": (1, 0),  # 0 dB
+    "(?<!\\ba)gain": (1, 0),  # 0 dB
 }
 #: Values of any key with such a word that change nothing.
 OFF = ("no", "none", "off", "false", "unknown")

@@ -29,6 +29,8 @@ OME_BEAM = {
     "DetectorSettings": ("Gain", "Offset", "Binning", "Integration"),
     "LightSourceSettings": ("Attenuation",),
 }
+#: Entries of Micro-Manager on which grey values depend in a way that is not stated.
+MANAGER_BEAM = ("Binning", "ROI")
 #: Entries of Dectris on which grey values depend in a way that is not stated.
 DECTRIS_BEAM = (
     *("Tau", "Ratecorr_lut_directory", "Retrigger_mode", "Flat_field"),
@@ -44,6 +46,7 @@ KEYS = (
     Key(
         ", ".join(
             [f"OME: {name} {key}" for name, own in OME_BEAM.items() for key in own]
+            + [f"Micro-Manager: {name}" for name in MANAGER_BEAM]
             + [f"Dectris: {name}" for name in DECTRIS_BEAM]
         ),
         "compared",
@@ -276,6 +279,9 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
                 head = head._replace(tops=_tops(file, "BitDepth", bits, head))
         if ms is not None:
             _add(stated, "ExposureTime", 0, milliseconds(file, ms, "ms"))
+        for name in MANAGER_BEAM:
+            if manager.get(name) is not None:
+                _add(stated, f"Micro-Manager {name}", 0, str(manager[name]))
     head = head._replace(stated=stated)
     entries = dict(LINE.findall(text)) if "#" in text else {}
     if {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:

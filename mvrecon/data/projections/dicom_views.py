@@ -2,6 +2,7 @@
 pydicom: the extra `io`.
 """
 
+import re
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -88,10 +89,17 @@ NO_PROJECTIONS = {
         ).split()
     },
 }
+#: Derivations that change no values beyond a codec's errors.
+COMPRESSED = re.compile("compress|jpeg|encod", re.IGNORECASE)
 #: All that are compared between views with a warning.
 COMPARED = (*exposures.DICOM, *BEAM, *CAMERA_PLACES, *OBJECT_PLACES)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
+    Key(
+        "DerivationDescription, DerivationCodeSequence",
+        "compared",
+        "with compression; a warning names other derivations",
+    ),
     Key(
         "PixelIntensityRelationship",
         "refused",
@@ -242,8 +250,17 @@ def dicom_header(file: Path) -> Header:
         tuple(map(image.value, ALIKE)),
         {name: _texts(image, name) for name in COMPARED},
         image.value("PixelIntensityRelationship") == "LIN",
-        unknown=image.private(),
+        unknown=[*image.private(), *_derivations(image)],
     )
+
+
+def _derivations(image: DicomImage) -> list[str]:
+    """How the image says that its values were derived, but by compression."""
+    texts = [str(text) for _, text in image.stated("DerivationDescription")]
+    codes = [code for _, items in image.stated("DerivationCodeSequence") for code in items]
+    texts += [str(code.get("CodeMeaning", "")) for code in codes]
+    derived = [text for text in texts if text and not COMPRESSED.search(text)]
+    return [f"derivation {text!r}" for text in derived]
 
 
 def _texts(image: DicomImage, name: str) -> list[str]:

@@ -63,6 +63,8 @@ class ImageFiles(ProjectionStack):
 
     def __init__(self, files: Sequence[Path]):
         headers = [header(file) for file in files]
+        if _ending(files[0]) == "DICOM" and any(head.dtype.kind == "f" for head in headers):
+            headers = [h._replace(dtype=np.dtype("f4")) for h in headers]  # also of a slope of 1
         for file, other in zip(files, headers, strict=True):
             if other[:2] != headers[0][:2]:
                 raise Refused(
@@ -201,6 +203,23 @@ def field_files(folder: Path, field: str) -> list[Path]:
     files = [file for file in _images(folder) if FIELDS[field].match(file.name)]
     if files:
         _check_kind(folder, files, f" of the {field} field")
+    return files
+
+
+def in_field(folder: Path, field: str) -> list[Path]:
+    """The images with names of the "dark" or of the "flat" field in a folder that is given as this
+    field; none if no image has one, so that all are the field's.
+
+    Raises:
+        Refused: others beside them with the name of neither field.
+    """
+    files = field_files(folder, field)
+    others = [f for f in _images(folder) if not any(x.match(f.name) for x in FIELDS.values())]
+    if files and others:
+        raise Refused(
+            f"{folder}: expected images of the {field} field alone, got {files[0].name} and "
+            f"{others[0].name}; move them to a folder of their own"
+        )
     return files
 
 

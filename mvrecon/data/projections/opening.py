@@ -20,7 +20,7 @@ from mvrecon.data.linked import Place, followed, listing, values_at
 from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
 from mvrecon.data.projections.frames import Frames, FrameViews
-from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, view_files
+from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, in_field, view_files
 from mvrecon.data.projections.nexus import IN_FILE, in_another
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import ProjectionStack
@@ -258,7 +258,7 @@ def _field(
     if value is not None:
         return _field_at(views, name, str(value), layout)
     if folders:
-        return open_projections(folders[0])
+        return _field_in(folders[0], name)
     return ImageFiles(files) if files else None
 
 
@@ -272,12 +272,18 @@ def _field_at(
         stack: ProjectionStack = FrameViews(frames, np.arange(frames.shape[0]))
     else:
         try:
-            other = open_projections(value)
+            other = _field_in(Path(value).expanduser(), name) if folder else open_projections(value)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}{_absent(views, f'data set {value}')}") from error
         field = other.fields.get(name, other)  # of a scan that has one
         stack = field if isinstance(field, ProjectionStack) else other
     return as_rows(stack, views.shape) if layout == "sinogram" else stack
+
+
+def _field_in(folder: Path, name: str) -> ProjectionStack:
+    """A field's images in a folder of their own."""
+    files = in_field(folder, name)
+    return ImageFiles(files) if files else open_projections(folder)
 
 
 def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:

@@ -281,6 +281,11 @@ class NpyViews(ProjectionStack):
         with file_errors(path, "cannot be read as a NumPy array"):
             array = np.lib.format.open_memmap(path, mode="r")
         self._array, self._bytes = array, array.offset + array.nbytes
+        if (got := path.stat().st_size) != self._bytes:
+            raise Refused(
+                f"{path}: expected one array of {self._bytes} bytes, got {got}; save all views as "
+                f"one array"
+            )
         if self._array.ndim == 2:
             self._array = self._array[None]
         if self._array.ndim != 3 or max(self._array.shape[1:]) > EDGE:

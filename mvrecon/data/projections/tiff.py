@@ -440,7 +440,15 @@ def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
         images = (image.imagej_metadata or {}).get("images", count)
         if planes := pages[0].tags.get("UIC2tag"):  # MetaMorph's, behind one page
             images = planes.count
-        for described in image.shaped_metadata or ():  # an array without directories of its views
-            if described.get("truncated"):
+        for described in image.shaped_metadata or ():
+            leading = [*described["shape"]]
+            while leading and math.prod(described["shape"][len(leading) :]) < pages[0].size:
+                leading.pop()
+            if len(running := [size for size in leading if size > 1]) > 1:
+                raise Refused(
+                    f"{file}: expected images along one axis, got {' x '.join(map(str, running))} "
+                    f"by tifffile's shape; save the views as a stack of their own"
+                )
+            if described.get("truncated"):  # an array without directories of its views
                 images += math.prod(described["shape"]) // math.prod(pages[0].shape) - 1
         yield pages, int(images)

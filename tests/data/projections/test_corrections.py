@@ -99,6 +99,11 @@ def test_flat_fields_are_numbers_files_or_from_the_folder(scan, tmp_path):
     with pytest.warns(UserWarning, match="flat field have means of 58000 to 60000"):
         opened(scan, flat=str(flats))
     Pillow.fromarray(np.full((6, 8), 60_200, "u2")).save(flats / "flat_1.tif")
+    Pillow.fromarray(np.full((6, 8), 100, "u2")).save(flats / "dark_0.tif")  # of the other field
+    assert torch.allclose(opened(scan, flat=str(flats)).whole().views, own, atol=1e-6)
+    (flats / "dark_0.tif").unlink()
+    with pytest.raises(Refused, match="of the flat field alone, got flat.tif and view_0.tif"):
+        opened(scan, flat=str(scan))  # the mean of the views was their flat field
     (scan / "flat.tif").unlink()
     flats.rename(scan / "Flats_before")  # a folder of the views' own
     assert torch.equal(opened(scan).whole().views, averaged)

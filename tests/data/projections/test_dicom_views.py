@@ -316,3 +316,30 @@ def test_volumes_doses_and_labels_are_no_projections(tags, tmp_path):
     dicom_image(tmp_path / "a.dcm", grey(), **tags)
     with pytest.raises(Refused, match=f"expected projections, got {next(iter(tags))}"):
         open_projections(tmp_path / "a.dcm")
+
+
+@pytest.mark.parametrize("numbers", [(1, 2, 1, 2), (1.5, 1, 1, 1)])
+def test_slopes_that_are_one_in_some_files_alone_are_applied(numbers, tmp_path):
+    """Also tried: intercepts of 0 and 1, and a flat field of another slope."""
+
+    def scaled(dataset, k):
+        dataset.RescaleSlope, dataset.RescaleIntercept = numbers[k], 0
+
+    options = {"kind": "intensities", "saturation": 65_535, "flat": 6e4, "find_bad_pixels": False}
+    found = opened(views(tmp_path, scaled), **options).stack.read(0, COUNT).numpy()
+    expected = grey()[:COUNT].astype("f4") * np.array(numbers, "f4")[:, None, None]
+    assert np.array_equal(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "expected"),
+    [
+        ("-log of flat-corrected images", "", ["derivation '-log of flat-corrected images'"]),
+        ("", "Pixel by pixel subtraction", ["derivation 'Pixel by pixel subtraction'"]),
+        ("JPEG 2000 lossless", "Lossy Compression", []),
+    ],
+)
+def test_derived_images_are_named_unless_compressed(text, code, expected, tmp_path):
+    codes = [item(CodeValue="1", CodingSchemeDesignator="DCM", CodeMeaning=code)] if code else []
+    tags = {"DerivationDescription": text, "DerivationCodeSequence": codes}
+    assert open_projections(views(tmp_path, **tags)).unknown == expected * COUNT

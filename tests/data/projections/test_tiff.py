@@ -311,3 +311,15 @@ def test_pages_that_are_not_in_the_order_of_their_numbers_are_refused(tmp_path):
             file.write(page, photometric="minisblack", metadata=None, extratags=[tag])
     with pytest.raises(Refused, match="PageNumber"):
         open_projections(tmp_path / "a.tif")
+
+
+def test_an_array_of_two_axes_of_images_is_refused(tmp_path):
+    """As tifffile describes it; further axes of one image change nothing."""
+    values = grey().reshape(6, 2, 6, 8)
+    tifffile.imwrite(tmp_path / "a.tif", values, photometric="minisblack")
+    with pytest.raises(Refused, match="images along one axis, got 6 x 2 by tifffile's shape"):
+        open_projections(tmp_path / "a.tif")
+    tifffile.imwrite(tmp_path / "b.tif", values.reshape(12, 1, 6, 8), photometric="minisblack")
+    assert np.array_equal(
+        open_projections(tmp_path / "b.tif").read(0, 12), values.reshape(12, 6, 8)
+    )

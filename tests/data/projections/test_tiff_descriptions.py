@@ -168,6 +168,21 @@ def test_times_and_bits_of_micro_manager_are_applied(tmp_path):
     assert measured.stack.top == 4095
 
 
+@pytest.mark.parametrize("entry", ['"Binning": {}', '"ROI": "{}-0-8-6"'])
+def test_regions_and_binning_of_micro_manager_are_compared_with_the_flat_field(entry, tmp_path):
+    for number, warned in ((1, False), (2, True)):
+        for name, own in (("views", 1), ("flat", number)):
+            values = exposed() if name == "views" else np.full((6, 8), FLAT, "u2")
+            tag = [(51123, "s", 0, "{" + entry.format(own) + "}", True)]
+            written(tmp_path / f"{name}.tif", values, extratags=tag)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            options = {"flat": str(tmp_path / "flat.tif"), "find_bad_pixels": False}
+            opened(tmp_path / "views.tif", **options)
+        words = "the flat field has the Micro-Manager"
+        assert any(words in str(one.message) for one in caught) == warned
+
+
 MANAGED = {
     "no bits": ('"BitDepth": ""', "BitDepth: expected a number, got ''", 65535, None),
     "bits of 0": ('"BitDepth": 0', "BitDepth from 1 to 16 bits, got 0", 65535, None),

@@ -127,6 +127,7 @@ TEXTS = {
     "Units: optical density": ["Units"],
     "ImageJ=1.54f\nunit=micron\nvunit=Gray Value\nmin=0.0": [],
     "ImageJ=1.54f\ngain=3": ["gain"],
+    "CameraGain: 2\nDataGain: 3\nagain: 4": ["CameraGain", "DataGain"],
     "SCIFIO=0.37\nscales=0.5,0.5\nunits=micron,micron\nimages=1": [],
     '<MetaData><prop id="autoscale-state" value="on"/></MetaData>': [],
     "Gamma = 2.2\nBlackLevel: 64\nBackground=0\nPedestal: 100": ["BlackLevel", "Gamma", "Pedestal"],
