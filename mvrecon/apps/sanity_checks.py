@@ -1,6 +1,6 @@
-"""Sanity checks of a reconstruction that raised no error: values that are none, mirrored views,
-exchanged axes, a wrong axis of rotation or range of angles, counts read as line integrals, a volume
-that does not explain its views.
+"""Sanity checks of a reconstruction that raised no error: NaN or infinite voxels, mirrored
+views, exchanged axes, a wrong axis of rotation or range of angles, counts read as line integrals, a
+volume that does not explain its views.
 """
 
 import inspect
@@ -111,7 +111,7 @@ def sanity_checks(
             )
         elif noise is not None:
             words += _of_hot_voxels(outcome.volume)
-    # a right volume leaves its views of the lost ones
+    # the views of a right volume differ from lost ones, which are zero, by their whole norm
     limit = math.hypot(limit, math.sqrt(len(outcome.lost) / len(scan.cameras)))
     beside = _beside(seen) if seen and view_nrmse > limit else 0.0
     # filtered back-projection is right on a grid of a part of the object, which explains no views

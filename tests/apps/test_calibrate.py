@@ -182,8 +182,8 @@ def test_the_uncertainty_of_an_axis_holds_that_of_a_tilt_that_is_fitted_with_it(
 
 
 def test_warnings_of_several_fits_are_those_of_the_last_alone(monkeypatch):
-    """A fit that ends after one round says so; its repetitions for a tilted axis said so again, or
-    that what a later one determines was kept.
+    """A fit that ends after one round warns; its repetitions for a tilted axis warned again, or of
+    parameters as kept that a later one determines.
     """
     fits, calibrated = [], correction.calibrated
 

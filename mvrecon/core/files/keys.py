@@ -125,25 +125,23 @@ def check_unknown(
     warn_of_unknown(path, [name for name, _ in unknown if not _neutral(name, effects)])
 
 
-def unknown_names(names: Iterable[str], keys: Sequence[Key], case: bool = True) -> list[str]:
-    """Return the names that are in no key of a format, each once; without `case`, regardless of
-    case.
-    """
+def unknown_names(names: Iterable[str], keys: Sequence[Key]) -> list[str]:
+    """Return the names that are in no key of a format, each once."""
     patterns = (re.escape(name) for key in keys for name in key.names)
-    words = "|".join(patterns).replace(r"\*", ".*").replace(r"\?", ".")
-    known = re.compile(words, 0 if case else re.IGNORECASE)
+    known = re.compile("|".join(patterns).replace(r"\*", ".*").replace(r"\?", "."))
     return [name for name in dict.fromkeys(names) if not known.fullmatch(name)]
 
 
 def unknown_entries(stated: Mapping[str, str], keys: Sequence[Key]) -> list[str]:
-    """Names of the entries of a header that are in no key of a format, regardless of case; not
-    those whose value is zero, empty, says that something is off, or, as a gain of 1, changes
+    """Names of the entries of a header, in lower case, that are in no key of a format regardless of
+    case; not those whose value is zero, empty or a word such as "off", or, as a gain of 1, changes
     nothing.
     """
+    known = [key._replace(name=key.name.lower()) for key in keys]
     nothing = (0, *OFF, *NOTHING)
     return [
         name
-        for name in unknown_names(stated, keys, case=False)
+        for name in unknown_names(stated, known)
         if _plain(stated[name]) not in nothing
         and (not _neutral(name, EFFECTS) or has_effect(name, stated[name]))
     ]

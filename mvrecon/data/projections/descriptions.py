@@ -109,7 +109,7 @@ PAIR = re.compile(r"<(?:name|key)>\s*([^<>]{1,60}?)\s*</\w+>\s*<[\w:.-]{1,60}>\s
 PROSE_SHOWN = 80
 PROSE = re.compile(
     r"(?<![<\w])(scaled|multiplied|divided|subtract(ed|ion)|correct(ed|ion)|normali[sz](ed|ation)|"
-    r"flipped|mirrored|rotated|transposed|inverted|linearised|linearized|logarithms?|"
+    r"flipped|mirrored|rotated|transposed|inverted|lineari[sz]ed|logarithms?|"
     r"log.transform(ed)?|optical densit(y|ies)|(ln|log(10|2|e)?) ?\()\b",
     re.IGNORECASE,
 )
