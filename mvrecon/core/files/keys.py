@@ -80,11 +80,6 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
     return _plain(value) not in (*map(_plain, values), *OFF)
 
 
-def mentions(text: str, effects: Mapping[str, Any] = EFFECTS) -> bool:
-    """Whether a text has a word of `effects` anywhere."""
-    return any(re.search(words, text, re.IGNORECASE) for words in effects)
-
-
 def _neutral(name: str, effects: Mapping[str, Any]) -> list[Any]:
     start = name[:SEARCHED]
     return [none for words, none in effects.items() if re.search(words, start, re.IGNORECASE)]
@@ -133,17 +128,17 @@ def unknown_names(names: Iterable[str], keys: Sequence[Key]) -> list[str]:
 
 
 def unknown_entries(stated: Mapping[str, str], keys: Sequence[Key]) -> list[str]:
-    """Names of the entries of a header, in lower case, that are in no key of a format regardless of
-    case; not those whose value is zero, empty or a word such as "off", or, as a gain of 1, changes
-    nothing.
+    """Names of the entries of a header that are in no key of a format regardless of case; not those
+    whose value is zero, empty or a word such as "off", or, as a gain of 1, changes nothing.
     """
     known = [key._replace(name=key.name.lower()) for key in keys]
     nothing = (0, *OFF, *NOTHING)
+    names = {name.lower(): name for name in stated}
     return [
         name
-        for name in unknown_names(stated, known)
+        for name in (names[lower] for lower in unknown_names(names, known))
         if _plain(stated[name]) not in nothing
-        and (not _neutral(name, EFFECTS) or has_effect(name, stated[name]))
+        and (not _neutral(name, IMAGE_EFFECTS) or has_effect(name, stated[name], IMAGE_EFFECTS))
     ]
 
 
@@ -152,9 +147,11 @@ def warn_of_unknown(path: str | Path, names: Iterable[str]) -> None:
 
     Args:
         path: path of the file, or of the folder of a set of files.
-        names: names of the unknown keys; of none there is no warning.
+        names: names of the unknown keys, of which those with a word of `IMAGE_EFFECTS` come first;
+            of none there is no warning.
     """
-    if unknown := list(dict.fromkeys(names)):
+    unknown = sorted(dict.fromkeys(names), key=lambda name: not _neutral(name, IMAGE_EFFECTS))
+    if unknown:
         more = f" and {len(unknown) - NAMED} others" if len(unknown) > NAMED else ""
         warnings.warn(
             f"{path}: ignores keys that mvrecon does not know: "

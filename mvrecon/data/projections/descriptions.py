@@ -1,6 +1,6 @@
 """What programs describe in an image beside its tags: OME (Goldberg and others, Genome Biology 6,
-2005), Micro-Manager, and the detectors of Dectris, whose negative pixels are bad ones; and the
-entries of other texts that may change values.
+2005), Micro-Manager, and the detectors of Dectris, whose negative pixels are bad ones; and what
+other texts state.
 """
 
 import math
@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from mvrecon.core.files.checks import MILLIMETRES, Refused, millimetres, shown
-from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, has_effect, mentions
+from mvrecon.core.files.checks import Refused, millimetres, shown
+from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, has_effect, unknown_entries
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -29,7 +29,8 @@ OME_BEAM = {
     "DetectorSettings": ("Gain", "Offset", "Binning", "Integration"),
     "LightSourceSettings": ("Attenuation",),
 }
-#: Entries of Micro-Manager on which grey values depend in a way that is not stated.
+#: Entries of Micro-Manager on which grey values depend in a way that is not stated, beside those
+#: with a word of `IMAGE_EFFECTS`, such as `Camera-Gain`.
 MANAGER_BEAM = ("Binning", "ROI")
 #: Entries of Dectris on which grey values depend in a way that is not stated.
 DECTRIS_BEAM = (
@@ -46,7 +47,7 @@ KEYS = (
     Key(
         ", ".join(
             [f"OME: {name} {key}" for name, own in OME_BEAM.items() for key in own]
-            + [f"Micro-Manager: {name}" for name in MANAGER_BEAM]
+            + [f"Micro-Manager: {name}" for name in (*MANAGER_BEAM, "*Gain*", "*Mirror*")]
             + [f"Dectris: {name}" for name in DECTRIS_BEAM]
         ),
         "compared",
@@ -71,13 +72,53 @@ KEYS = (
         "the camera decides",
     ),
     Key(
-        "ImageJ: unit, ImageJ: yunit, ImageJ: zunit, SCIFIO: units, SCIFIO: scales, ImageJ: vunit",
+        ", ".join(
+            f"Dectris: {name}"
+            for name in (
+                *("Detector", "Silicon*", "thickness", "Exposure_period", "Excluded_pixels"),
+                *("Trim_*", "Image_path", "Wavelength", "Detector_2theta", "Flux", "Polarization"),
+                *("Alpha", "Kappa", "Phi*", "Chi*", "Oscillation_axis", "N_oscillations"),
+                *("Start_position", "Position_increment", "Shutter_time", "CBF_Template_file"),
+            )
+        ),
         "ignored",
-        "of the pixel size, and the name of values that cf calibrates",
+        "of the scan and the detector",
+    ),
+    Key(
+        "ImageJ: ImageJ, ImageJ: images, ImageJ: channels, ImageJ: slices, ImageJ: frames, "
+        "ImageJ: cf, ImageJ: c0, ImageJ: c1, SCIFIO: SCIFIO, SCIFIO: axes, SCIFIO: lengths, "
+        "SCIFIO: images, SCIFIO: channels, SCIFIO: slices, SCIFIO: frames, tifffile: shape, "
+        "tifffile: axes, tifffile: truncated",
+        "compared",
+        "the axes and the calibration, as ImageDescription's",
+    ),
+    Key(
+        "ImageJ: unit, ImageJ: ?unit, ImageJ: spacing, ImageJ: ?origin, ImageJ: min, ImageJ: max, "
+        "ImageJ: mode, ImageJ: loop, ImageJ: hyperstack, ImageJ: finterval, ImageJ: fps, "
+        "SCIFIO: units, SCIFIO: scales, SCIFIO: bitsPerPixel",
+        "ignored",
+        "of the pixel size, the display, and the name of values that cf calibrates",
+    ),
+    Key(
+        ", ".join(
+            f"*: {name}"
+            for name in (
+                *("date*", "time", "timestamp", "creation time", "title", "author", "artist"),
+                *("operator", "user", "copyright", "software*", "version", "make", "model"),
+                *("host*", "source", "filename", "file name"),
+            )
+        ),
+        "ignored",
+        "texts of any program",
     ),
 )
-#: Entries that are known, by the name of a program.
-KNOWN = [name.split(": ", 1) for key in KEYS for name in key.names]
+#: Programs that describe images in lines of a name and a value, and marks of their texts.
+MARKS = {
+    "ImageJ": r"^ImageJ=",
+    "SCIFIO": r"^SCIFIO=",
+    "Dectris": r"^# ",
+    "tifffile": r"^\{\"shape\": ",
+}
 #: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
 OME, ATTRIBUTE = re.compile(r"<(\w+:)?OME\b"), re.compile(r"([\w-]+)\s*=\s*[\"']([^\"']*)[\"']")
 #: Parts of OME's description that may quote its elements: comments, and what other programs wrote.
@@ -92,40 +133,16 @@ OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
 LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
-#: Entries of any text: a name, `=`, `:`, a tabulator or a blank before a number, and a word or a
-#: list; and elements of XML.
-ENTRY = re.compile(
-    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)(?:[\"']?[ ]*[:=\t][ \t]*[\"']?|[ ]+(?=[-+]?\.?\d))"
-    r"(?=(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+))"
-)
-ELEMENT = re.compile(r"<([\w:.-]{1,60})(?:\s[^<>]{0,200})?>\s*([^<>\s][^<>]{0,200})</")
-NAMED = re.compile(
-    r"\b(?:name|key)\s*=\s*[\"']([^\"'<>]{1,60})[\"'][^<>]{0,200}?(?:value\s*=\s*[\"']|>\s*)"
-    r"([^\"'<>]{1,200})"
-)
-PAIR = re.compile(r"<(?:name|key)>\s*([^<>]{1,60}?)\s*</\w+>\s*<[\w:.-]{1,60}>\s*([^<>]{1,200})</")
-#: Characters of a line of prose that are named, and words by which it states what was done to grey
-#: values.
-PROSE_SHOWN = 80
-PROSE = re.compile(
-    r"(?<![<\w])(scaled|multiplied|divided|subtract(ed|ion)|correct(ed|ion)|normali[sz](ed|ation)|"
-    r"flipped|mirrored|rotated|transposed|inverted|lineari[sz]ed|logarithms?|"
-    r"log.transform(ed)?|optical densit(y|ies)|(ln|log(10|2|e)?) ?\()\b",
-    re.IGNORECASE,
-)
-#: Names of scales of the display, of stages and lenses; and units of other things than values.
-OF_DISPLAY = re.compile(
-    r"spatial|^stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|pixel.?(size|spacing)|"
-    r"(?<![a-z])(date|time)(?=\W*$|.?(unit|scale))",
-    re.IGNORECASE,
-)
-OTHER_UNITS = {
-    *MILLIMETRES,
-    *("count", "counts", "adu", "dn", "pixel", "pixels", "px", "inch", "in"),
-    *("s", "sec", "ms", "us"),
-    *("deg", "degrees", "rad"),
-    *("v", "kv", "kev", "ev", "ma", "ua", "a", "w", "c", "k", "bit", "bits"),
-}
+#: A value in an element of XML, an object within one of JSON, and where a text divides: lines,
+#: parts of lists, elements.
+ELEMENT = re.compile(r"<([\w:.-]+)[^<>]*>\s*([^<>\s][^<>]*)</")
+OBJECT = re.compile(r"\"\s*:\s*\{\s*\"")
+PART = re.compile(r"[\n\r;<>{}]|,(?=\s*[\"'[])|,(?=\s*[^\W\d][\w .-]{0,60}[:=])")
+#: An entry, a name and a value; and the name of another within its value.
+ENTRY = re.compile(r"([^\W\d][^:=\t\"']*?)[\"']?\s*[:=\t]\s*(.*)")
+INNER = re.compile(r"[^\W\d][\"']?\s*[:=]")
+#: Characters of a part of a text that are named.
+PART_SHOWN = 80
 #: A comma between thousands.
 THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
@@ -138,38 +155,29 @@ def without_own_id(text: str) -> str:
 
 
 @lru_cache(maxsize=32)
-def effects(text: str) -> list[str]:
-    """Names of the entries of a text that may change values: lines of a name and a value, JSON,
-    XML; and the starts of lines of prose with a word of `PROSE`. None of OME's and MetaMorph's
-    texts, whose entries are of the display and the microscope.
+def unknown_parts(text: str) -> list[str]:
+    """What a text states beside the entries of `KEYS`: the names of its other entries (lines of a
+    name and a value, JSON, XML), and other lines with words; but no entry whose value is zero,
+    empty or a word such as "off". OME's and MetaMorph's texts have no such parts.
     """
     if OME.search(text) or text.startswith("<MetaData"):
         return []
-    known = {name for program, name in KNOWN if program == "Dectris" or program in text}
-    lines = LINE.sub("", text).splitlines()
-    parts = [(x, ENTRY.findall(x) if mentions(x, IMAGE_EFFECTS) else []) for x in lines]
-    found = [pair for _, pairs in parts for pair in pairs]
-    for pattern in (LINE, ELEMENT, NAMED, PAIR):
-        found += pattern.findall(text)
-    prose = {
-        line.strip()[:PROSE_SHOWN]
-        for line, pairs in parts
-        if PROSE.search(line) and not any(mentions(name, IMAGE_EFFECTS) for name, _ in pairs)
-    }
-    return sorted(
-        prose
-        | {
-            name.strip()
-            for name, value in found
-            if name.strip() not in known
-            and not OF_DISPLAY.search(name)
-            and any(
-                has_effect(name, part.rstrip("xX"), IMAGE_EFFECTS)
-                and part.lower() not in OTHER_UNITS
-                for part in re.findall(r"[^\s,;()\[\]]+", value)
-            )
-        }
-    )
+    program = next((name for name, mark in MARKS.items() if re.search(mark, text, re.M)), "text")
+    stated, names = {}, {}
+    lines = ELEMENT.sub(r"\n\1: \2\n<", LINE.sub(r"\1: \2", text))
+    for part in PART.split(OBJECT.sub(".", lines)):
+        plain = part.strip(" \t,[]()#*\"'")
+        entry = ENTRY.fullmatch(plain)
+        name, value = entry.groups() if entry else (plain, plain)
+        if not (entry or re.search(r"[^\W\d]{2}", name)) or part.startswith(("/", "?", "!")):
+            continue
+        value = re.sub(r"[\s,\"'()[\]]+", " ", value)
+        brief = plain if INNER.search(value) else name
+        key = f"{program}: {name}"
+        key = key if stated.get(key, value) == value else f"{program}: {plain}"
+        stated[key] = value
+        names[key] = brief if len(brief) <= PART_SHOWN else f"{brief[:PART_SHOWN]}..."
+    return [names[key] for key in unknown_entries(stated, KEYS)]
 
 
 @lru_cache(maxsize=4)
@@ -279,9 +287,10 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
                 head = head._replace(tops=_tops(file, "BitDepth", bits, head))
         if ms is not None:
             _add(stated, "ExposureTime", 0, milliseconds(file, ms, "ms"))
-        for name in MANAGER_BEAM:
-            if manager.get(name) is not None:
-                _add(stated, f"Micro-Manager {name}", 0, str(manager[name]))
+        for name, value in manager.items():
+            if name in MANAGER_BEAM or has_effect(name, "", IMAGE_EFFECTS):
+                value = value.get("PropVal") if isinstance(value, dict) else value
+                _add(stated, f"Micro-Manager {name}", 0, str(value))
     head = head._replace(stated=stated)
     entries = dict(LINE.findall(text)) if "#" in text else {}
     if {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:

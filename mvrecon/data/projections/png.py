@@ -40,10 +40,10 @@ PNG_KEYS = (
     ),
     Key(
         "text: ...",
-        "compared",
-        "entries such as `slope = 2`, with what changes nothing; a warning names them",
+        "ignored",
+        "what programs state; a warning names it, but entries of 0, off or nothing",
     ),
-    Key(", ".join(TEXTS), "ignored", "other texts"),
+    Key(", ".join(TEXTS), "ignored", "chunks of these texts"),
     Key(
         "gAMA, sRGB, iCCP, cICP, cHRM, tRNS, bKGD, PLTE, sPLT, hIST, mDCV, cLLI",
         "ignored",
@@ -77,10 +77,10 @@ def png_header(file: Path) -> Header:
         stated |= {f"eXIf: {name}": value for name, value in exif.items()}
         check_keys(file, PNG_KEYS, stated.get)
         texts = image.text.items() if {*TEXTS} & {*chunks} else ()
-        entries = [
-            f"text: {entry}"
+        parts = [
+            f"text: {part}"
             for name, text in texts
-            for entry in descriptions.effects(f"{name}: {text}")
+            for part in descriptions.unknown_parts(f"{name}: {text}")
         ]
         kind = MODES.get(image.mode)
         if kind is None or max(rows, columns) > EDGE:
@@ -97,7 +97,7 @@ def png_header(file: Path) -> Header:
         if (time := exif.get("ExposureTime")) is not None:
             stated["ExposureTime"] = descriptions.milliseconds(file, float(time), "s")
         head = head._replace(stated={name: [text] for name, text in stated.items()})
-        return head._replace(unknown=unknown_names([*chunks, *entries], PNG_KEYS))
+        return head._replace(unknown=unknown_names([*chunks, *parts], PNG_KEYS))
 
 
 def _exif(image: Any) -> dict[str, Any]:

@@ -81,9 +81,14 @@ TIFF_KEYS = (
     Key(", ".join(ANDOR_BEAM), "compared", "of views and flat fields; warned of"),
     Key(
         "ImageDescription: ..., areaDetector: ...",
-        "compared",
-        "entries of other programs, such as `slope = 2`, with what changes nothing; a warning "
-        "names them",
+        "ignored",
+        "what other programs state; a warning names it, but entries of 0, off or nothing",
+    ),
+    Key(
+        "areaDetector: ColorMode, areaDetector: BayerPattern, areaDetector: DriverFileName, "
+        "areaDetector: Manufacturer, areaDetector: Model",
+        "ignored",
+        "of the camera",
     ),
     Key("Gamma", "refused", "linear values, also in EXIF", (1,)),
     Key("OpcodeList1", "refused", "store the values that its operations give"),
@@ -147,8 +152,8 @@ TIFF_KEYS = (
     ),
     Key(
         "DocumentName, ImageDescription, Make, Model, PageName, Software, DateTime*, Artist, "
-        "HostComputer, Copyright, XMP, IPTCNAA, ImageResources, ImageTitle, ImageID, "
-        "ImageUniqueID, ImageSourceData, OriginalFileName, ProcessingSoftware, XPTitle, XPComment, "
+        "HostComputer, Copyright, IPTCNAA, ImageResources, ImageTitle, ImageID, "
+        "ImageUniqueID, ImageSourceData, OriginalFileName, ProcessingSoftware, XPTitle, "
         "XPAuthor, XPKeywords, XPSubject, Rating*, Padding, OffsetSchema",
         "ignored",
         "texts",
@@ -167,7 +172,7 @@ TIFF_KEYS = (
         "RecommendedExposureIndex, ISOSpeedLatitude*, OffsetTime*, SubsecTime*, "
         "ComponentsConfiguration, CompressedBitsPerPixel, ShutterSpeedValue, ApertureValue, "
         "BrightnessValue, MaxApertureValue, Subject*, MeteringMode, LightSource, Flash*, "
-        "FocalLength*, FocalPlane*, SensingMethod, MakerNote, UserComment, Temperature, Humidity, "
+        "FocalLength*, FocalPlane*, SensingMethod, MakerNote, Temperature, Humidity, "
         "Pressure, PixelXDimension, PixelYDimension, Interoperability*, FileSource, Scene*, "
         "CustomRendered, WhiteBalance, Contrast, Saturation, Sharpness, "
         "DeviceSettingDescription, DigitalZoomRatio, CameraOwnerName, BodySerialNumber, Lens*, "
@@ -261,7 +266,7 @@ def _check_tags(file: Path, page: Any) -> None:
 
 
 def _names(page: Any) -> set[str]:
-    """Names of the tags of a page and of its EXIF, and of entries of texts that change values."""
+    """Names of the tags of a page and of its EXIF, and what its texts state."""
     names = {str(name) for name in page.tags.valueof("ExifTag") or ()}
     texts = {"ImageDescription": [page.description]}
     for tag in page.tags:
@@ -270,7 +275,7 @@ def _names(page: Any) -> set[str]:
         else:
             names.add(f"tag {tag.name}" if tag.name.isdigit() else tag.name)
     for where, own in texts.items():
-        names |= {f"{where}: {entry}" for text in own for entry in descriptions.effects(text)}
+        names |= {f"{where}: {part}" for text in own for part in descriptions.unknown_parts(text)}
     return names
 
 

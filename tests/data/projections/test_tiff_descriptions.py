@@ -168,12 +168,18 @@ def test_times_and_bits_of_micro_manager_are_applied(tmp_path):
     assert measured.stack.top == 4095
 
 
-@pytest.mark.parametrize("entry", ['"Binning": {}', '"ROI": "{}-0-8-6"'])
-def test_regions_and_binning_of_micro_manager_are_compared_with_the_flat_field(entry, tmp_path):
+@pytest.mark.parametrize(
+    "entry",
+    [
+        *('"Binning": {}', '"ROI": "{}-0-8-6"', '"Camera-Gain": {}', '"Camera-Offset": "{}"'),
+        '"Camera-TransposeMirrorX": {{"PropType": "Integer", "PropVal": {}}}',
+    ],
+)
+def test_settings_of_micro_manager_are_compared_with_the_flat_field(entry, tmp_path):
     for number, warned in ((1, False), (2, True)):
         for name, own in (("views", 1), ("flat", number)):
             values = exposed() if name == "views" else np.full((6, 8), FLAT, "u2")
-            tag = [(51123, "s", 0, "{" + entry.format(own) + "}", True)]
+            tag = [(51123, "s", 0, f"{{{entry.format(own)}}}", True)]
             written(tmp_path / f"{name}.tif", values, extratags=tag)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
