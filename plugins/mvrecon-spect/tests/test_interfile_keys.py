@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.opening import open_projections
 from mvrecon.geometry.grid import Grid
 from mvrecon_spect.files.interfile_keys import CONTENT, KEYS
 from mvrecon_spect.files.interfile_views import InterfileViews
@@ -226,6 +227,19 @@ def test_the_geometry_of_gate_s_head_is_no_key_of_the_views(tmp_path):
     assert np.array_equal(read(tmp_path, VIEWS, "GATE GEOMETRY :=", *lines), VALUES)
     with pytest.raises(Refused, match="crystal x translation"):
         read(tmp_path, VIEWS, *lines, "crystal x translation (cm) := 3")
+
+
+@pytest.mark.parametrize("ending", ["hs", "h00", "h33", "hdr", "HDR"])
+def test_headers_of_projections_have_the_endings_of_several_programs(ending, tmp_path):
+    """STIR's .hs, SIMIND's .h00 and GATE's .hdr, which other formats use as well."""
+    path = tmp_path / f"a.{ending}"
+    path.write_text(VIEWS)
+    VALUES.tofile(tmp_path / "a.v")
+    stack = open_projections(path)
+    assert stack.kind == "counts" and np.array_equal(stack.read(0, len(VALUES)), VALUES)
+    path.write_text("ENVI\nsamples = 2\nlines = 3\nbands = 4\n")
+    with pytest.raises(Refused, match="expected an Interfile header"):
+        open_projections(path)
 
 
 SCALES = {

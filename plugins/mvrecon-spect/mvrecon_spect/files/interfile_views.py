@@ -1,4 +1,4 @@
-"""Interfile projections (.hs) as measured views, read one by one."""
+"""Interfile projections (.hs; SIMIND: .h00, GATE: .hdr) as measured views, read one by one."""
 
 import warnings
 from pathlib import Path
@@ -22,7 +22,7 @@ class InterfileViews(ProjectionStack):
     to it.
 
     Args:
-        path: path of the header, .hs.
+        path: path of the header.
 
     Raises:
         FileNotFoundError: the header or the data file does not exist.
