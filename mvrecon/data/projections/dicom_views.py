@@ -51,6 +51,8 @@ CAMERA_PLACES = (
     "DetectorFocalCenterRadialDistance SourceAngularPositionShift SourceAxialPositionShift "
     "SourceRadialDistanceShift"
 ).split()
+#: Angles by which the camera is turned about the patient.
+PRIMARY = ("PositionerPrimaryAngle", "PositionerIsocenterPrimaryAngle")
 #: Attributes that say where the object is, or move it; a flat field has none.
 OBJECT_PLACES = [
     *(
@@ -197,8 +199,12 @@ DICOM_KEYS = (
     ),
     Key(", ".join(OBJECT_PLACES), "compared", "of all views; warned of, as the camera decides"),
     Key(
-        "PositionerPrimaryAngle, PositionerSecondaryAngle, PositionerPrimaryAngleIncrement, "
-        "PositionerSecondaryAngleIncrement, PositionerIsocenterPrimaryAngle, "
+        ", ".join((*PRIMARY, "PositionerPrimaryAngleIncrement")),
+        "compared",
+        "with the turn of the cameras, where the secondary angle is 0; warned of",
+    ),
+    Key(
+        "PositionerSecondaryAngle, PositionerSecondaryAngleIncrement, "
         "PositionerIsocenterSecondaryAngle, BeamAngle, ColumnAngulation, GantryAngle, "
         "GantryPitchAngle, TubeAngle, FramePrimaryAngleVector, FrameSecondaryAngleVector, "
         "XRaySourceIsocenterPrimaryAngle, DetectorIsocenterPrimaryAngle, "
@@ -251,7 +257,27 @@ def dicom_header(file: Path) -> Header:
         {name: _texts(image, name) for name in COMPARED},
         image.value("PixelIntensityRelationship") == "LIN",
         unknown=[*image.private(), *_derivations(image)],
+        angles=_angles(image),
     )
+
+
+def _angles(image: DicomImage) -> list[float]:
+    """The primary angles of the positioner in degrees, a number for each frame; none unless they
+    are stated, beside a secondary angle that is zero or missing.
+    """
+    steps, aside = (
+        np.atleast_1d(image.value(f"Positioner{axis}AngleIncrement") or 0)
+        for axis in ("Primary", "Secondary")
+    )
+    for name in PRIMARY:
+        angles, second = image.values(name), image.values(name.replace("Primary", "Secondary"))
+        if None in angles or any(map(float, filter(None, second))) or aside.any():
+            continue
+        if len(steps) == image.frames > 1:  # from the first frame on, or from the frame before
+            steps = steps.cumsum() if len({*steps[1:]}) == 1 else steps
+            return [float(angle + step) for angle, step in zip(angles, steps, strict=True)]
+        return [float(angle) for angle in angles]
+    return []
 
 
 def _derivations(image: DicomImage) -> list[str]:

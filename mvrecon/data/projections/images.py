@@ -105,6 +105,8 @@ class ImageFiles(ProjectionStack):
         self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm = headers[0].pixel_mm
         self.unknown = [name for head in headers for name in head.unknown]
+        angles = [angle for head in headers for angle in head.angles]
+        self.angles = [angles[k] for k in order] if len(angles) == len(order) else ()
         self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,

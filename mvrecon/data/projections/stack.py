@@ -31,11 +31,14 @@ from mvrecon.data.storage import (
     unknown_members,
 )
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.turning import MAX_ANGLE, apart, turned
 
 #: Maximum number of views of a stack.
 VIEWS = 2**16
 #: Relative difference of pixel sizes between a file and the cameras due to rounding.
 MAX_PITCH_DIFFERENCE = 1e-3
+#: Cosine from which the columns of all cameras are taken as parallel to the axis of their turn.
+ALONG = 0.99
 #: Name of the attenuation map of simulated counts, beside their views.h5.
 MU_FILE = "mu.nii.gz"
 #: Pixels per read when iterating over a whole stack, 64 MiB in float32.
@@ -60,6 +63,7 @@ class Header(NamedTuple):
         places: for a set of files, the places of the pages of each, by the file's path.
         own: those of the pages of this file.
         unknown: keys that the reader does not know, and that may change what it reads.
+        angles: angles in degrees by which the pages' cameras are turned, if stated.
     """
 
     shape: tuple[int, int]
@@ -74,6 +78,7 @@ class Header(NamedTuple):
     places: Mapping[str, Sequence[PlaceInSet]] = {}
     own: Sequence[PlaceInSet] = ()
     unknown: Sequence[str] = ()
+    angles: Sequence[float] = ()
 
     @property
     def words(self) -> str:
@@ -136,6 +141,8 @@ class ProjectionStack(ABC):
     units: str = ""
     #: Keys of the files that their reader does not know, and that may change values or geometry.
     unknown: Sequence[str] = ()
+    #: Angles in degrees by which the files say that the cameras are turned, in either direction.
+    angles: Sequence[float] = ()
     #: Name and options of the camera that the file states, those of the detector without pixels;
     #: the name is None where it states no beam.
     rig: Mapping[str, Any] | None = None
@@ -197,7 +204,11 @@ class ProjectionStack(ABC):
 
         Raises:
             Refused: pixels of another size, or what a format adds.
+
+        Warns:
+            UserWarning: cameras that turn about the rows' common normal by other angles.
         """
+        self._check_turn(cameras)
         if self.pixel_mm is None:
             return
         down, right = self.pixel_mm
@@ -208,6 +219,25 @@ class ProjectionStack(ABC):
             raise Refused(
                 f"{self.path}: expected cameras with the file's pixels of {down:g} x {right:g} mm "
                 f"(v, u), got {got} mm"
+            )
+
+    def _check_turn(self, cameras: Cameras) -> None:
+        stated = cameras.v.new_tensor(self.angles)
+        if len(stated) != self.n_views or apart(stated, stated[0]).max() <= MAX_ANGLE:
+            return  # none, or an object that turns before a camera at rest
+        upright = cameras.v.sum(dim=0)
+        if upright.norm() < ALONG * cameras.v.norm(dim=-1).sum():
+            return
+        got, turn = turned(cameras, upright), stated - stated[0]
+        off = torch.stack([apart(got, turn), apart(got, -turn)])
+        off = off[off.amax(dim=1).argmin()]
+        if off.max() > MAX_ANGLE:
+            k = int(off.argmax())
+            wanted, found = (apart(one[k], turn[0]) for one in (turn, got))
+            warnings.warn(
+                f"{self.path}: states that its cameras turn by {wanted:.1f} degrees from "
+                f"{self.names[0]} to {self.names[k]}, got cameras that turn by {found:.1f}",
+                stacklevel=2,
             )
 
     @abstractmethod

@@ -2,6 +2,7 @@
 attributes, is compared, refused by name, or named in one warning for all files.
 """
 
+import re
 import struct
 import warnings
 
@@ -11,12 +12,14 @@ import pytest
 from pydicom.data import get_testdata_file
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.core.parts import CAMERAS
 from mvrecon.data.projections.opening import open_projections
 from tests.data.projections.conftest import CT_PD, VIEWS, dicom_image, grey, opened
 from tests.data.projections.test_dicom_pixels import item
 from tests.data.projections.test_dicom_places import OWN, nested
 
 COUNT = 4
+PRIMARY = "PositionerPrimaryAngle"
 
 
 def views(folder, change=None, **tags):
@@ -343,3 +346,61 @@ def test_derived_images_are_named_unless_compressed(text, code, expected, tmp_pa
     codes = [item(CodeValue="1", CodingSchemeDesignator="DCM", CodeMeaning=code)] if code else []
     tags = {"DerivationDescription": text, "DerivationCodeSequence": codes}
     assert open_projections(views(tmp_path, **tags)).unknown == expected * COUNT
+
+
+#: Angles of views by how a file states them: of each image, or from the first frame on, or from the
+#: frame before.
+TURNS = {
+    "images": ([0.0, 10.0, 20.0, 30.0], None),
+    "from the first": (-15.0, [0.0, 10.0, 20.0, 30.0]),
+    "from the frame before": (-15.0, [0.0, 10.0, 10.0, 10.0]),
+    "clockwise, across 0": ([15.0, 5.0, 355.0, 345.0], None),
+    "uneven": (0.0, [0.0, 10.5, 19.6, 30.2]),
+}
+
+
+@pytest.mark.parametrize("case", TURNS)
+@pytest.mark.parametrize("beam", ["cone", "parallel"])
+def test_angles_are_compared_with_the_turn_of_the_cameras(case, beam, tmp_path):
+    """Of files of one frame and of several; the zero and the direction of angles differ between
+    devices. An object that turns before a camera at rest, and a positioner that is also turned
+    about another axis, are not compared.
+    """
+    angles, steps = TURNS[case]
+    if steps is None:
+        path = views(tmp_path, lambda dataset, k: setattr(dataset, PRIMARY, angles[k]))
+    else:
+        path = tmp_path / "a.dcm"
+        stated = {PRIMARY: angles, f"{PRIMARY}Increment": steps}
+        dicom_image(path, grey()[:COUNT], Modality="XA", **stated)
+
+    def messages(step):
+        rig = {"name": "circular", "sid": 800.0, "sdd": 1200.0}
+        rig = rig if beam == "cone" else {"name": "parallel"}
+        rig |= {"n_views": COUNT, "angles": [step * k for k in range(COUNT)], "small_arc": True}
+        detector = {"pixels": (6, 8), "pixel_mm": (1.0, 1.0)}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            stack.check_rig(CAMERAS.from_config({**rig, "detector": detector}))
+        return [str(one.message) for one in caught]
+
+    stack = open_projections(path)
+    assert messages(10.0) == messages(-10.0) == []
+    (message,) = messages(12.0)
+    assert re.search(r"turn by 30\.[02] degrees from .*, got cameras that turn by 36\.0", message)
+
+
+@pytest.mark.parametrize("secondary", [None, 0.0, 20.0])
+def test_angles_that_cannot_be_compared_are_not(secondary, tmp_path):
+    """With a secondary angle; and equal angles."""
+    tags = {} if secondary is None else {"PositionerSecondaryAngle": secondary}
+    angles = open_projections(
+        views(tmp_path, lambda dataset, k: setattr(dataset, PRIMARY, 10.0 * k), **tags)
+    ).angles
+    assert list(angles) == ([] if secondary else [0.0, 10.0, 20.0, 30.0])
+    rest = open_projections(views(tmp_path, **{PRIMARY: 30.0}))
+    options = {"n_views": COUNT, "sid": 800.0, "sdd": 1200.0, "name": "circular"}
+    detector = {"pixels": (6, 8), "pixel_mm": (1.0, 1.0)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rest.check_rig(CAMERAS.from_config({**options, "detector": detector}))

@@ -9,9 +9,9 @@ import torch
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.turning import MAX_ANGLE, apart, turned
 from mvrecon_spect.files.interfile import Header, check_repeated, numbers_of, read_header
 from mvrecon_spect.files.stir import views_shape
-from mvrecon_spect.files.turning import MAX_ANGLE, apart, turned
 
 #: Relative difference of durations in whole seconds.
 CLOSE = 0.01

@@ -10,8 +10,8 @@ from mvrecon.data.dicom_image import DicomImage
 from mvrecon.data.projections.images import ImageFiles
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.geometry.cameras.camera import Cameras
+from mvrecon.geometry.cameras.turning import MAX_ANGLE, apart, turned
 from mvrecon_spect.files.nm import EnergyWindow, Frame, View, read_frames
-from mvrecon_spect.files.turning import MAX_ANGLE, apart, turned
 
 #: Relative difference of durations for rounding.
 MAX_DURATION = 1e-3
