@@ -175,6 +175,8 @@ def test_numbers_in_names_decide_the_order(tmp_path):
         ["p9", "p10", "p11"],
         ["a1_b2", "a1_b10", "a2_b2", "a2_b10"],
         ["0007", "8", "09"],
+        ["image 98", "image 99", "image100"],  # aligned by blanks
+        ["im   9 a", "im  10 a", "im  11 a"],
     ):
         paths = [tmp_path / f"{name}.tif" for name in names]
         assert ordered(paths[::-1]) == paths
