@@ -11,6 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 #: Maximum bytes of a text file, of a YAML file (whose parser is slow), and of an unpacked volume
 #: and chunk of a file.
 MAX_TEXT_BYTES, MAX_YAML_BYTES, VOLUME, MAX_CHUNK_BYTES = 16 * 2**20, 64 * 2**10, 8 * 2**30, 2**28
@@ -256,6 +258,25 @@ def check_file(path: Path, expected: str) -> None:
         raise IsADirectoryError(f"{path}: is a folder; expected {expected}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file; expected {expected}")
+
+
+def npy_array(path: Path) -> np.memmap:
+    """The one array of a NumPy file, without reading its values.
+
+    Raises:
+        FileNotFoundError: nothing is there.
+        Refused: no array, Python objects, cut short, or followed by other bytes, as a second array.
+    """
+    check_file(path, "a NumPy array")
+    with file_errors(path, "cannot be read as a NumPy array"):
+        array = np.lib.format.open_memmap(path, mode="r")
+    expected = array.offset + array.nbytes
+    if (got := path.stat().st_size) != expected:
+        raise Refused(
+            f"{path}: expected one array of {expected} bytes, got {got}; save all views as one "
+            f"array"
+        )
+    return array
 
 
 def check_declared(

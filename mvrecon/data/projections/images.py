@@ -180,11 +180,6 @@ def view_files(
         Refused: no image, too many, or of several formats; DICOM images of several series, or only
         some with their own InstanceNumber; CIL's scale beside them; see `ordered`.
     """
-    if (scales := folder / CIL_SCALES).exists():
-        raise Refused(
-            f"{scales}: expected images with their own values, got CIL's scale and offset; write "
-            f"the images without compression, or remove the file if they were applied"
-        )
     excluded = {field.resolve() for field in fields}
     images = [file for file in _images(folder, pattern) if file.resolve() not in excluded]
     views = [f for f in images if not any(x.match(f.name) for x in FIELDS.values())] or images
@@ -209,23 +204,30 @@ def field_files(folder: Path, field: str) -> list[Path]:
 
 
 def in_field(folder: Path, field: str) -> list[Path]:
-    """The images with names of the "dark" or of the "flat" field in a folder that is given as this
-    field; none if no image has one, so that all are the field's.
+    """The images of a folder that is given as the "dark" or the "flat" field, in any order: those
+    with its name, else those with the name of neither field, else all.
 
     Raises:
-        Refused: others beside them with the name of neither field.
+        Refused: some with its name beside others with the name of neither, no images, or images of
+            several formats.
     """
-    files = field_files(folder, field)
-    others = [f for f in _images(folder) if not any(x.match(f.name) for x in FIELDS.values())]
+    files, images = field_files(folder, field), _images(folder)
+    others = [f for f in images if not any(x.match(f.name) for x in FIELDS.values())]
     if files and others:
         raise Refused(
             f"{folder}: expected images of the {field} field alone, got {files[0].name} and "
             f"{others[0].name}; move them to a folder of their own"
         )
-    return files
+    _check_kind(folder, files or others or images, f" of the {field} field")
+    return files or others or images
 
 
 def _images(folder: Path, pattern: str | None = None) -> list[Path]:
+    if (scales := folder / CIL_SCALES).exists():
+        raise Refused(
+            f"{scales}: expected images with their own values, got CIL's scale and offset; write "
+            f"the images without compression, or remove the file if they were applied"
+        )
     files = []
     with file_errors(folder, f"has no names like {pattern!r}", "expected such as scan_*.tif"):
         inside = sorted(folder.glob(pattern or "*"))

@@ -34,6 +34,10 @@ Field = float | str | Path | None
 EXPOSURE_NAMES = re.compile(r"exposure|time|mas\b", re.IGNORECASE)
 #: Share by which the means of a flat field's images may differ, as before and after a scan.
 MAX_FLAT_CHANGE = 0.02
+#: Share by which the means of a flat field's parts may differ, as of a beam that moves.
+MAX_PART = 0.1
+#: Share, and standard deviations of the pixels, by which images of one field do not differ.
+MAX_CHANGE, MAX_DEVIATIONS = 0.5, 10
 
 
 def open_projections(
@@ -193,7 +197,8 @@ def mean_field(
             other units.
 
     Raises:
-        Refused: several, no flat one, or one of another size or another part of the detector.
+        Refused: several, no flat one, or one of another size or another part of the detector, of
+            the views themselves, or of images of several fields.
     """
     stack = _field(views, where, name, value, layout)
     if isinstance(stack, int | float):
@@ -222,18 +227,46 @@ def mean_field(
     if len({units.casefold() for units in (stack.units, views.units) if units}) > 1:
         unknown.append(f"{name}@units={stack.units}")
     warn_of_unknown(stack.path, unknown)
-    mean, levels = stack.mean()
-    least, most = levels.min().item(), levels.max().item()
-    if name == "flat" and most - least > MAX_FLAT_CHANGE * levels.mean().item():
-        warnings.warn(
-            f"{stack.path}: images of the flat field have means of {least:g} to {most:g}; "
-            f"views are divided by their mean, which does not follow the beam",
-            stacklevel=2,
-        )
+    mean, parts = stack.mean()
+    _check_alike(stack.path, name, mean, parts)
     applied = exposure_names(views, exposure)
     if applied or exposure is None or name == "dark":
         warn_of_others(views, stack, name, applied)
     return mean
+
+
+def _check_alike(
+    path: Path, name: str, mean: Float[Tensor, "v u"], parts: Float[Tensor, "m i j"]
+) -> None:
+    """Check that a field's images show the same: their mean, and means of their parts.
+
+    Warns:
+        UserWarning: images of a flat field that differ.
+
+    Raises:
+        Refused: images of several fields.
+    """
+    levels = parts.mean(dim=(1, 2))
+    least, most, level = levels.min().item(), levels.max().item(), abs(levels.mean().item())
+    if most - least > max(MAX_CHANGE * level, MAX_DEVIATIONS * mean.std(correction=0).item()):
+        raise Refused(
+            f"{path}: expected images of the {name} field alone, got some with means of {least:g} "
+            f"to {most:g}; move those of another field, or views, to a folder of their own"
+        )
+    if name == "dark":
+        return
+    if most - least > MAX_FLAT_CHANGE * level:
+        warnings.warn(
+            f"{path}: images of the flat field have means of {least:g} to {most:g}; "
+            f"views are divided by their mean, which does not follow the beam",
+            stacklevel=3,
+        )
+    elif (change := (parts.amax(dim=0) - parts.amin(dim=0)).max().item()) > MAX_PART * level:
+        warnings.warn(
+            f"{path}: images of the flat field differ by up to {100 * change / level:.0f} % in "
+            f"parts of the detector; are views among them, or does the beam move?",
+            stacklevel=3,
+        )
 
 
 def _field(
@@ -258,32 +291,38 @@ def _field(
     if value is not None:
         return _field_at(views, name, str(value), layout)
     if folders:
-        return _field_in(folders[0], name)
+        return ImageFiles(in_field(folders[0], name))
     return ImageFiles(files) if files else None
 
 
 def _field_at(
     views: ProjectionStack, name: str, value: str, layout: Layout | None
-) -> ProjectionStack:
-    """A field's images by their name in the scan's HDF5 file, or by their own path."""
+) -> ProjectionStack | float:
+    """A field by its name in the scan's HDF5 file, or by its own path."""
     folder = Path(value).expanduser().is_dir()
     if views.scan and not folder and (place := _place_in(views, value)):
         frames = Frames(place, views.scan.parent.resolve())
-        stack: ProjectionStack = FrameViews(frames, np.arange(frames.shape[0]))
+        stack: ProjectionStack | float = FrameViews(frames, np.arange(frames.shape[0]))
     else:
         try:
-            other = _field_in(Path(value).expanduser(), name) if folder else open_projections(value)
+            path = Path(value).expanduser()
+            other = ImageFiles(in_field(path, name)) if folder else open_projections(path)
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}{_absent(views, f'data set {value}')}") from error
-        field = other.fields.get(name, other)  # of a scan that has one
-        stack = field if isinstance(field, ProjectionStack) else other
-    return as_rows(stack, views.shape) if layout == "sinogram" else stack
+        if name in other.fields:  # of a scan
+            stack = other.fields[name]
+        elif path.resolve() == views.path.resolve() or _files(views) & _files(other):
+            raise Refused(f"{value}: expected images of the {name} field, got those of the views")
+        else:
+            stack = other
+    if layout == "sinogram" and isinstance(stack, ProjectionStack):
+        return as_rows(stack, views.shape)
+    return stack
 
 
-def _field_in(folder: Path, name: str) -> ProjectionStack:
-    """A field's images in a folder of their own."""
-    files = in_field(folder, name)
-    return ImageFiles(files) if files else open_projections(folder)
+def _files(stack: ProjectionStack) -> set[Path]:
+    """The files of a stack of images; none of other stacks."""
+    return {file.resolve() for file in getattr(stack, "files", ())}
 
 
 def _place_in(views: ProjectionStack, name: str | Path) -> Place | None:

@@ -135,7 +135,11 @@ def _sorted(
         paths: paths of the files.
         number: pattern of numbers.
     """
-    parts = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
+    splits = {path: re.split(f"({number})", path.stem.lower()) for path in paths}
+    parts = {  # without the blanks that align numbers: image   9, image  10
+        path: [text if k % 2 else text.rstrip() for k, text in enumerate(split)]
+        for path, split in splits.items()
+    }
     _move_signs(list(parts.values()))
     keys = {
         path: [Decimal(text.replace(",", ".")) if k % 2 else text for k, text in enumerate(part)]

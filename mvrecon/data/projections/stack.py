@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, shown
+from mvrecon.core.files.checks import EDGE, Refused, check_file, file_errors, npy_array, shown
 from mvrecon.core.machine import check_memory
 from mvrecon.data.attenuation import check_unit_of_views
 from mvrecon.data.itk import itk_image
@@ -43,6 +43,8 @@ ALONG = 0.99
 MU_FILE = "mu.nii.gz"
 #: Pixels per read when iterating over a whole stack, 64 MiB in float32.
 READ_PIXELS = 2**24
+#: Parts of an image, down and across, whose means tell images apart.
+PARTS = (4, 4)
 #: A place in a set of files: the number of the image, and of the plane along C, Z and T.
 PlaceInSet = tuple[int, ...]
 
@@ -278,15 +280,15 @@ class ProjectionStack(ABC):
         for first in range(0, self.n_views, step):
             yield self.read(first, min(first + step, self.n_views))
 
-    def mean(self) -> tuple[Float[Tensor, "v u"], Float[Tensor, " m"]]:
-        """Mean of all views, float32, in the stored unit, and the mean of each; memory of a few
-        views.
+    def mean(self) -> tuple[Float[Tensor, "v u"], Float[Tensor, "m i j"]]:
+        """Mean of all views, float32, in the stored unit, and the means of `PARTS` of each; memory
+        of a few views.
         """
-        total, levels = torch.zeros(self.shape, dtype=torch.float64), []
+        total, parts = torch.zeros(self.shape, dtype=torch.float64), []
         for block in self.chunks():
             total += block.sum(dim=0, dtype=torch.float64)
-            levels.append(block.mean(dim=(1, 2), dtype=torch.float64))
-        return (total / self.n_views).float(), torch.cat(levels)
+            parts.append(F.adaptive_avg_pool2d(block, PARTS))
+        return (total / self.n_views).float(), torch.cat(parts)
 
 
 #: Attributes of the views in a views.h5, and their axes.
@@ -307,15 +309,8 @@ class NpyViews(ProjectionStack):
     """
 
     def __init__(self, path: Path):
-        check_file(path, "a NumPy array [m v u]")
-        with file_errors(path, "cannot be read as a NumPy array"):
-            array = np.lib.format.open_memmap(path, mode="r")
-        self._array, self._bytes = array, array.offset + array.nbytes
-        if (got := path.stat().st_size) != self._bytes:
-            raise Refused(
-                f"{path}: expected one array of {self._bytes} bytes, got {got}; save all views as "
-                f"one array"
-            )
+        self._array = npy_array(path)
+        self._bytes = path.stat().st_size
         if self._array.ndim == 2:
             self._array = self._array[None]
         if self._array.ndim != 3 or max(self._array.shape[1:]) > EDGE:
@@ -356,6 +351,7 @@ class ItkViews(ProjectionStack):
                     f"direction {(affine[:3, :2] / spacing).T.round(6).tolist()}"
                 )
             self.pixel_mm = (float(down), float(right))
+            self.detector = {"spacing": self.pixel_mm}
 
     def _block(self, first: int, last: int) -> np.ndarray:
         return self._image.read(first, last)

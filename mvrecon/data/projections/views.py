@@ -61,6 +61,9 @@ PLAIN_UNITS = {
 }
 #: Line integrals below this are more than an imperfect flat field: 5 % brighter than it.
 NEGATIVE = -0.05
+#: Line integrals above this in all pixels but some are those of views a tenth as bright as their
+#: flat field; and the share of these pixels.
+DIM, BRIGHT = math.log(10), 1e-3
 #: Views before and after each that zingers of one or two rows are compared with.
 ADJACENT = 2
 #: Rows that make an image of a view.
@@ -78,7 +81,7 @@ class Corrected:
         mask: measured pixels, no part of which is dead or saturated.
         odd: numbers of pixels by name: "saturated", before binning; "floored", whose transmission
             was at most the floor; "zingers", bright in a single view; "unread", which a file marks
-            as bad in a view; and "negative", line integrals below `NEGATIVE`.
+            as bad in a view; "negative", line integrals below `NEGATIVE`; and "dim", above `DIM`.
     """
 
     views: Float[Tensor, "m v u"]
@@ -152,12 +155,13 @@ class MeasuredViews:
             )
         self.gains: Float[Tensor, " m"] | None = None
         self.exposure: Float[Tensor, " m"] | None = None
+        of_light = ("exposure", "flat", "dark", "saturation")
+        if kind != "intensities" and (given := [x for x in of_light if getattr(options, x)]):
+            raise Refused(
+                f"{options.path}: expected intensities for views.{given[0]}, got {kind}; without "
+                f"it they are used as they are"
+            )
         if options.exposure is not None:
-            if kind != "intensities":
-                raise Refused(
-                    f"{options.path}: expected intensities for views.exposure, which their light "
-                    f"is divided by, got {kind}"
-                )
             where = Path(options.path).expanduser()
             whole = exposures(options.exposure, stack, where, options.flat, options.layout)
             self.exposure = whole[:: options.every]
@@ -317,7 +321,7 @@ class MeasuredViews:
                 f"in {name} (shutter closed, or dark and flat swapped?)"
             )
         found = {"saturated": saturated, "floored": low, "zingers": bright, "unread": unread}
-        found["negative"] = views < NEGATIVE
+        found["negative"], found["dim"] = views < NEGATIVE, views > DIM
         return Corrected(views, mask, Counter({name: int(x.sum()) for name, x in found.items()}))
 
     def _raw(self, first: int, last: int) -> Float[Tensor, "m v u"]:
@@ -451,7 +455,7 @@ class MeasuredViews:
 
     def warn_of_values(self, odd: Counter[str]) -> None:
         """Warn of pixels that were saturated, at the floor, bright or unread in single views, if
-        any, and of line integrals most of which are negative.
+        any, and of line integrals most of which are negative, or all of which are large.
         """
         if 2 * odd["negative"] > (pixels := self.n_views * math.prod(self.shape)):
             cause = (
@@ -463,6 +467,14 @@ class MeasuredViews:
             warnings.warn(
                 f"{self.options.path}: {odd['negative']} of {pixels} line integrals are below "
                 f"{NEGATIVE:g}; {cause}",
+                stacklevel=3,
+            )
+        if odd["dim"] > (1 - BRIGHT) * pixels:
+            warnings.warn(
+                f"{self.options.path}: the views are less than a tenth as bright as their flat "
+                f"field in all pixels; does the object cover the detector? Else they were taken "
+                f"with another exposure or beam, or stored on another scale, or the numbers of "
+                f"views.exposure are not relative to the flat field's",
                 stacklevel=3,
             )
         floor = self.options.floor

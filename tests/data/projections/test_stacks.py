@@ -30,9 +30,11 @@ def test_every_form_of_a_scan_has_the_same_views(form, tmp_path):
     assert torch.equal(stack.read(0, VIEWS), expected)
     assert torch.equal(stack.read(9, 11), expected[9:11])  # view_10 follows view_9
     assert torch.equal(torch.cat(list(stack.chunks(pixels=100))), expected)
-    mean, levels = stack.mean()
+    mean, parts = stack.mean()
     assert torch.allclose(mean, expected.double().mean(dim=0).float())
-    assert torch.allclose(levels, expected.double().mean(dim=(1, 2)))
+    for i, rows in enumerate((slice(0, 2), slice(1, 3), slice(3, 5), slice(4, 6))):  # six rows
+        columns = expected[:, rows].unflatten(2, (4, 2))
+        assert torch.allclose(parts[:, i], columns.mean(dim=(1, 3)))
     assert len(set(stack.names)) == VIEWS
     with pytest.raises(IndexError, match=f"within 0 to {VIEWS}, got 11 to 13"):
         stack.read(11, 13)
@@ -173,6 +175,8 @@ def test_numbers_in_names_decide_the_order(tmp_path):
         ["p9", "p10", "p11"],
         ["a1_b2", "a1_b10", "a2_b2", "a2_b10"],
         ["0007", "8", "09"],
+        ["image 98", "image 99", "image100"],  # aligned by blanks
+        ["im   9 a", "im  10 a", "im  11 a"],
     ):
         paths = [tmp_path / f"{name}.tif" for name in names]
         assert ordered(paths[::-1]) == paths

@@ -1,11 +1,14 @@
 """Angles in files: every form gives the same rig; radians and other columns are refused."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.geometry.cameras.formats.common import angles_in
+from mvrecon.geometry.cameras.formats.common import angles_in, numbers_in
 from mvrecon.geometry.cameras.rigs import circular, parallel
 
 ANGLES = [-10.0, 0.5, 12.25, 90.0, 181.0, 200.0, 270.5, 1e1]
@@ -103,3 +106,75 @@ def test_small_arcs_and_numbers_of_angles(tmp_path):
     assert torch.equal(rig.origin, parallel(8, PLATE, angles=np.linspace(0, 3, 8).tolist()).origin)
     with pytest.raises(Refused, match="expected an angle of each of 7 views, got 8"):
         parallel(7, PLATE, angles=tmp_path / "a.npy", small_arc=True)
+
+
+ORDERS = {
+    "names sorted as text": ("file,angle", [f"v_{k}.tif" for k in sorted(range(12), key=str)]),
+    "from the last view": ("view,angle", [*range(11, -1, -1)]),
+    "numbers with zeros": ("i;angle", [f"{k:04}" for k in (3, 0, 1, 2)]),
+}
+
+
+@pytest.mark.parametrize("case", ORDERS)
+def test_lines_in_another_order_than_they_state_are_refused(case, tmp_path):
+    """Also exposures, which are read alike. A first column that does not count is no order: names
+    without numbers, times, and angles.
+    """
+    head, texts = ORDERS[case]
+    mark = "," if "," in head else ";"
+    lines = [f"{text}{mark}{10 * k}" for k, text in enumerate(texts)]
+    (tmp_path / "a.csv").write_text("\n".join([head, *lines]))
+    with pytest.raises(Refused, match="lines in the order of the views, got"):
+        angles_in(tmp_path / "a.csv")
+    with pytest.raises(Refused, match="lines in the order of the views, got"):
+        numbers_in(tmp_path / "a.csv", "exposures", re.compile("angle"))
+
+
+@pytest.mark.parametrize(
+    ("head", "first"),
+    [
+        ("time,theta", ["9.5", "7.25", "8.5"]),
+        ("counts,theta", ["512", "480", "530"]),
+        ("name,theta", ["a", "c", "b"]),
+        ("scan,theta", ["bone2_a", "bone2_c", "bone2_b"]),
+        ("exposure,theta", ["1", "2", "1"]),
+        ("file,theta", ["s_0009.tif", "s_0010.tif", "s_0011.tif"]),
+        ("target angle,theta", ["0", "2", "1"]),
+    ],
+)
+def test_a_first_column_that_counts_no_views_is_no_order(head, first, tmp_path):
+    (tmp_path / "a.csv").write_text("\n".join([head, *(f"{x},{k}" for k, x in enumerate(first))]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        numbers = numbers_in(tmp_path / "a.csv", "angles", re.compile("^theta"))[1]
+    assert numbers == [0.0, 1.0, 2.0]
+
+
+STATED = {
+    "theta\n0\n9": [],
+    "# counter-clockwise, in degrees\n0\n9": [],
+    "# scan of a bone, anticlockwise; ccw\n0\n9": [],
+    "view,angle,exposure,time\n0,0,1,1\n1,9,2,3": [],
+    "# clockwise\n0\n9": ["clockwise"],
+    "angle_cw\n0\n9": ["angle_cw"],
+    "view,angle,tilt,offset_u\n0,0,1,1\n1,9,2,3": ["tilt", "offset_u"],
+    "angle,x shift\n0,0\n9,2": ["x shift"],
+}
+
+
+@pytest.mark.parametrize("text", STATED)
+def test_what_a_table_of_angles_states_beside_them_is_named(text, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert angles_in(tmp_path / "a.csv") == [0.0, 9.0]
+    named = [str(one.message).split("does not know: ")[1].split("; if")[0] for one in caught]
+    assert named == [", ".join(STATED[text])] * bool(STATED[text])
+
+
+def test_a_second_array_behind_the_angles_is_refused(tmp_path):
+    with (tmp_path / "a.npy").open("wb") as file:
+        for part in (ANGLES[:4], ANGLES[4:]):
+            np.save(file, np.array(part))
+    with pytest.raises(Refused, match="expected one array of"):
+        angles_in(tmp_path / "a.npy")

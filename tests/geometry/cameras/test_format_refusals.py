@@ -107,11 +107,11 @@ def test_vectors_and_json_that_are_not_rigs_are_refused(tmp_path):
         with pytest.raises(Refused, match=message):
             tigre.read(path)
     np.save(tmp_path / "rig.npy", np.array([{}] * 12, dtype=object), allow_pickle=True)
-    with pytest.raises(Refused, match="floating"):
+    with pytest.raises(Refused, match="Python objects"):
         astra.read(tmp_path / "rig.npy", [6, 9])
     np.save(tmp_path / "cut.npy", np.zeros((3, 12)))
     (tmp_path / "cut.npy").write_bytes((tmp_path / "cut.npy").read_bytes()[:-8])
-    with pytest.raises(Refused, match="another length"):
+    with pytest.raises(Refused, match="cut short"):
         astra.read(tmp_path / "cut.npy", [6, 9])
 
 

@@ -60,6 +60,12 @@ def test_axes_of_the_file_are_converted_to_those_of_the_volume(name, world, tmp_
     kind, options = FORMATS[name]
     kind.write(crooked(), tmp_path / "rig", world=world)
     assert same(kind.read(tmp_path / "rig", world=world, **options), crooked(), 1e-9)
+    lines = (tmp_path / "rig").read_text().splitlines(keepends=True)
+    stated = lines.pop(0) if lines[0].startswith("#") else ""
+    if stated and world != "RAS":
+        with pytest.raises(Refused, match="first line"):
+            kind.read(tmp_path / "rig", world="RAS", **options)
+    (tmp_path / "rig").write_text("".join(lines))  # as other programs write it
     other = kind.read(tmp_path / "rig", world="RAS", **options)
     assert same(other.moved(to_ras(world), torch.zeros(3)), crooked(), 1e-9)
 

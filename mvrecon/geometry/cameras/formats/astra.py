@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mvrecon.core.files.checks import Refused, file_errors, text_of
+from mvrecon.core.files.checks import Refused, file_errors, npy_array
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.cameras.convert import from_astra, to_astra
 from mvrecon.geometry.cameras.formats import common
@@ -50,10 +50,8 @@ def read(
         if str(path).endswith(".npy")
         else common.rows_of(path, common.number_lines(path), 12)
     )
-    head = "" if str(path).endswith(".npy") else text_of(path).partition("\n")[0].strip()
-    asked = _head(shape, parallel, unit_mm, world)
-    if head.startswith("# ASTRA ") and head != asked:
-        raise Refused(f"{path}: expected options as its first line says, {head}, got {asked}")
+    if not str(path).endswith(".npy"):
+        common.check_head(path, _head(shape, parallel, unit_mm, world))
     if not parallel and ((vectors[:, :3].norm(dim=-1) - 1).abs() < 1e-6).all():
         warnings.warn(
             f"{path}: sources of cone beams are {unit_mm:g} mm from the origin; if they are rays "
@@ -68,26 +66,11 @@ def read(
 
 
 def _npy(path: Path) -> torch.Tensor:
-    """Vectors of a .npy file, whose size is checked before allocating memory."""
-    with file_errors(path, "is not a .npy file of vectors"), path.open("rb") as file:
-        version = np.lib.format.read_magic(file)
-        reader = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, fortran, kind = reader(file)
-        if (
-            len(shape) != 2
-            or shape[1] != 12
-            or not 0 < shape[0] <= common.VIEWS
-            or kind.kind != "f"
-        ):
-            raise Refused(f"{path}: expected floating [views 12], got {kind} {shape}")
-        raw = file.read(shape[0] * 12 * kind.itemsize + 1)
-        if len(raw) != shape[0] * 12 * kind.itemsize:
-            raise Refused(f"{path}: expected {shape[0]} views, got a file of another length")
-        array = np.frombuffer(raw, kind).reshape(shape, order="F" if fortran else "C")
-        return torch.from_numpy(array.astype(np.float64))
+    """Vectors of a .npy file, whose shape is checked before they are read."""
+    array = npy_array(path)
+    if array.dtype.kind != "f" or array.shape[1:] != (12,) or not 0 < len(array) <= common.VIEWS:
+        raise Refused(f"{path}: expected floating [views 12], got {array.dtype} {array.shape}")
+    return torch.from_numpy(array.astype(np.float64))
 
 
 def write(cameras: Cameras, path: str | Path, world: str = "RAS", flip_rows: bool = True) -> None:

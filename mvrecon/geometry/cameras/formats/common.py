@@ -14,7 +14,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.core.files.atomic import write_text
-from mvrecon.core.files.checks import Refused, check_file, file_errors, shown, text_of
+from mvrecon.core.files.checks import (
+    Refused,
+    check_file,
+    file_errors,
+    npy_array,
+    shown,
+    text_of,
+)
+from mvrecon.core.files.keys import IMAGE_EFFECTS, mentions, warn_of_unknown
 from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
@@ -131,6 +139,12 @@ UNITS = {
 STATED = (
     r"(^|_|[(\[:=/]|\bin|angles?|theta|rotation)\s*({0})\s*(\.?$|[)\],;(])|\bin\s+({0})(?![\w.])"
 )
+#: The sense of a rotation that is not the one of the cameras, and words in the names of a table's
+#: other columns that would turn, move or scale views.
+CLOCKWISE = r"(?<!counter.)(?<!anti.)(?<![a-z])(clockwise|cw)(?![a-z])"
+TURNS = {**IMAGE_EFFECTS, "shift": 0}
+#: A whole number, or a name, in the first column of a table.
+COUNTED = re.compile(r"\d+|.*[A-Za-z].*")
 #: Names of the columns of angles in a table, among others.
 ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
 
@@ -183,7 +197,7 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, lis
     check_file(path, f"{what} as .npy, as text with one number per line, or as a table")
     with file_errors(path, f"has no {what}", "expected one number per line, or a table"):
         if path.suffix.lower() == ".npy":
-            values = np.load(path, mmap_mode="r", allow_pickle=False)
+            values = npy_array(path)
             if values.dtype.kind not in "iuf" or values.size != max(values.shape, default=0):
                 raise Refused(f"{path}: expected numbers [m], got {values.dtype} {values.shape}")
             numbers = np.ravel(values[: VIEWS + 1]).astype(float).tolist()
@@ -229,8 +243,34 @@ def _column(
             f"{path}: expected as many numbers in every line{' as names' if names else ''}, got "
             f"{shown(sorted(widths))}; is it cut short, or are its decimals not points?"
         )
+    if found[0]:
+        _check_lines(path, names[0], [row[0] for row in rows])
+    others = [name for k, name in enumerate(names) if k != found[0] and mentions(name, TURNS)]
+    name = names[found[0]] if names else title
+    said = [text for text in dict.fromkeys((name, title)) if mentions(text, {CLOCKWISE: None})]
+    warn_of_unknown(path, [*said, *others])
     numbers = [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
-    return names[found[0]] if names else title, numbers
+    return name, numbers
+
+
+def _check_lines(path: Path, name: str, texts: Sequence[str]) -> None:
+    """Check that the lines of a table are in the order of its first column, if this counts them:
+    whole numbers, or names of files that have one.
+
+    Raises:
+        Refused: they are in another, as that of names sorted as text: view_10 before view_2.
+    """
+    counts = [re.findall(r"\d+", Path(text).stem) for text in texts]
+    if ANGLE_NAMES.search(name) or not all(counts) or not all(map(COUNTED.fullmatch, texts)):
+        return
+    numbers = [int(count[-1]) for count in counts]
+    if sorted(numbers) != numbers and (np.diff(sorted(numbers)) == 1).all():
+        late = next(k for k, step in enumerate(np.diff(numbers)) if step < 0)
+        raise Refused(
+            f"{path}: expected lines in the order of the views, got {shown(texts[late])} before "
+            f"{shown(texts[late + 1])}; sort them, or remove the first column if it is another "
+            f"order"
+        )
 
 
 def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Tensor, "m k"]:
@@ -246,6 +286,21 @@ def rows_of(path: str | Path, lines: list[list[float]], width: int) -> Float[Ten
             f"{shown(sorted(lengths))} numbers; is it cut short?"
         )
     return torch.tensor(lines, dtype=torch.float64)
+
+
+def check_head(path: str | Path, asked: str) -> None:
+    """Compare the first line of a file with the one that mvrecon writes for the same options.
+
+    Args:
+        path: path of a text file, of any program.
+        asked: the line for the options of the reader.
+
+    Raises:
+        Refused: mvrecon wrote the file with other options.
+    """
+    head = text_of(path, strict=False).partition("\n")[0].strip()
+    if head[:8] == asked[:8] and head != asked:  # such as "# ASTRA "
+        raise Refused(f"{path}: expected options as its first line says, {head}, got {asked}")
 
 
 def save_lines(path: str | Path, head: str, rows: Iterable[Iterable[float]], comma: str) -> None:

@@ -38,9 +38,11 @@ def read(
     Raises:
         OSError: the file cannot be read.
         ValueError: an invalid file, non-finite values, matrices of parallel beams, or left-handed
-            ones: rows that run the other way than `flip_rows` states.
+            ones: rows that run the other way than `flip_rows` states; options that contradict the
+            first line that `write` wrote.
     """
     lines, plate = common.number_lines(path), Detector.of(detector)
+    common.check_head(path, _head(plate.pixels, world))
     if any(plate.offset_mm):
         raise ValueError(f"expected a detector without offset_mm, which P has, got {plate}")
     if lines and {len(line) for line in lines} == {4} and len(lines) % 3 == 0:
@@ -79,6 +81,12 @@ def write(cameras: Cameras, path: str | Path, world: str = "RAS") -> None:
             f"expected pixels of one width for 3x4 matrices, got {widths.min().item():g} to "
             f"{widths.max().item():g} mm; files.save keeps them"
         )
-    rows, columns = cameras.shape
-    head = f"# 3x4 matrices, row by row: mm ({world}) to pixels, {rows} rows, {columns} columns"
-    common.save_lines(path, head, common.into_world(cameras, world).matrix.flatten(1).tolist(), " ")
+    matrices = common.into_world(cameras, world).matrix.flatten(1).tolist()
+    common.save_lines(path, _head(cameras.shape, world), matrices, " ")
+
+
+def _head(shape: Sequence[int], world: str) -> str:
+    """The first line of a file that `write` writes."""
+    return (
+        f"# 3x4 matrices, row by row: mm ({world}) to pixels, {shape[0]} rows, {shape[1]} columns"
+    )

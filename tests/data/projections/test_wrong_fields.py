@@ -1,0 +1,165 @@
+"""Fields that are not those of the views: the views themselves, several fields at once, other
+pixels, another scale; and right ones, by whatever names.
+
+Truth: grey values of a smooth body that moves from view to view, D + (F - D) exp(-p). Tried beside
+these, of 97 fields: stacks of TIFF and NumPy, sinograms, PNG and 32-bit means beside views of 16
+bits, masks of every type, fields of other sizes, transposed, swapped, NaN, lists and patterns.
+"""
+
+import warnings
+
+import numpy as np
+import pytest
+import SimpleITK as sitk
+import tifffile
+
+from mvrecon.core.files.checks import Refused
+from tests.data.projections.conftest import array, opened
+from tests.data.projections.test_nikon import xtekct
+
+DARK, FLAT, VIEWS, ROWS, COLUMNS = 100, 50_100, 12, 20, 24
+K, Y, X = np.ogrid[:VIEWS, :ROWS, :COLUMNS]
+BODY = 0.8 * np.exp(-((X - 12 - 6 * np.cos(0.5 * K)) ** 2) / 30 - (Y - 7) ** 2 / 40)
+
+
+def grey(exposure=1.0, body=BODY):
+    """Grey values [m v u] of 16 bits."""
+    return (DARK + (FLAT - DARK) * exposure * np.exp(-body)).round().astype("u2")
+
+
+def images(folder, values, names="view_{}.tif"):
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, image in enumerate(values):
+        tifffile.imwrite(folder / names.format(k), image)
+    return folder
+
+
+def level(value, count=1, kind="u2"):
+    return np.full((count, ROWS, COLUMNS), value, kind)
+
+
+@pytest.fixture
+def scan(tmp_path):
+    return images(tmp_path / "scan", grey())
+
+
+@pytest.mark.parametrize("name", ["flat", "dark"])
+@pytest.mark.parametrize("form", ["folder", "stack", "npy"])
+def test_the_views_are_none_of_their_own_fields(form, name, scan, tmp_path):
+    path = scan
+    if form == "stack":
+        tifffile.imwrite(path := tmp_path / "scan.tif", grey())
+    elif form == "npy":
+        path = array(tmp_path / "scan.npy", grey())
+    with pytest.raises(Refused, match=f"images of the {name} field, got those of the views"):
+        opened(path, **{"flat": FLAT, "dark": DARK, name: str(path)})
+
+
+def test_another_scan_as_flat_field_is_warned_of(scan, tmp_path):
+    """Its views have one mean, but not one in each part of the detector."""
+    other = images(tmp_path / "other", grey(body=BODY + 0.4))
+    with pytest.warns(UserWarning, match="in parts of the detector; are views among them"):
+        opened(scan, dark=DARK, flat=str(other))
+
+
+NAMES = {
+    "before and after": ["before_1", "before_2", "after_1", "after_2"],
+    "in words": ["before", "after"],
+    "with gaps": ["img_1", "img_2", "img_5"],
+}
+
+
+@pytest.mark.parametrize("case", NAMES)
+@pytest.mark.parametrize("inside", [False, True])
+def test_images_of_a_field_have_any_names_and_no_order(inside, case, scan, tmp_path):
+    for field, value in (("flat", FLAT), ("dark", DARK)):
+        folder = (scan if inside else tmp_path / "fields") / f"{field}s"
+        folder.mkdir(parents=True)
+        for k, name in enumerate(NAMES[case]):
+            tifffile.imwrite(folder / f"{name}.tif", level(value + (-1) ** k)[0])
+    options = {} if inside else {n: str(tmp_path / "fields" / f"{n}s") for n in ("flat", "dark")}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = opened(scan, find_bad_pixels=False, **options).whole().views
+    assert np.abs(found.numpy() - BODY).max() < 1e-3
+
+
+@pytest.mark.parametrize("name", ["flat", "dark"])
+@pytest.mark.parametrize("names", ["img_{}.tif", None])
+def test_images_of_both_fields_are_none_of_one(names, name, scan, tmp_path):
+    """In one folder, numbered or by names that mvrecon does not know."""
+    both = (level(FLAT)[0], level(DARK)[0])
+    for k, field in enumerate(both):
+        file = names.format(k) if names else ("FF_1.tif", "DF_1.tif")[k]
+        images(tmp_path / "fields", [field], file)
+    with pytest.raises(Refused, match=f"of the {name} field alone, got some with means of 100 to"):
+        opened(scan, **{"flat": FLAT, "dark": DARK, name: str(tmp_path / "fields")})
+
+
+def test_noise_and_drift_of_a_field_are_read(scan, tmp_path):
+    """Of 100 photons, of a beam that loses 1.5 %, and dark images of a few counts, one of which is
+    brighter by half.
+    """
+    rng = np.random.default_rng(0)
+    beam = np.linspace(1, 0.985, 5)[:, None, None] * level(FLAT - DARK, 5, "f8")
+    images(tmp_path / "flats", (DARK + 500 * rng.poisson(beam / 500)).astype("u2"))
+    images(tmp_path / "darks", rng.poisson(np.r_[level(2.0, 4, "f8"), level(3.0, 1, "f8")]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        opened(scan, dark=str(tmp_path / "darks"), flat=str(tmp_path / "flats"))
+
+
+def test_fields_of_another_pixel_size_are_refused(tmp_path):
+    """As of another binning, whose images were cropped to as many pixels."""
+    for name, values, spacing in (
+        ("scan", grey(), 0.4),
+        ("same", level(FLAT), 0.4),
+        ("binned", level(FLAT), 0.8),
+    ):
+        image = sitk.GetImageFromArray(values)
+        image.SetSpacing((spacing, spacing, 1.0))
+        sitk.WriteImage(image, str(tmp_path / f"{name}.mha"))
+    opened(tmp_path / "scan.mha", dark=DARK, flat=str(tmp_path / "same.mha"))
+    with pytest.raises(Refused, match="flat field with the spacing .0.4, 0.4. of the views, got"):
+        opened(tmp_path / "scan.mha", dark=DARK, flat=str(tmp_path / "binned.mha"))
+
+
+@pytest.mark.parametrize(
+    ("scale", "exposure", "warned"),
+    [(1.0, None, False), (1 / 16, None, True), (1.0, 1, False), (1.0, 40, True)],
+)
+def test_views_that_are_all_darker_than_a_tenth_of_their_flat_field_are_named(
+    scale, exposure, warned, tmp_path
+):
+    """Whatever the cause, as views that are brighter are: a field of 12 bits that was scaled to 16,
+    exposures in ms that are not relative to the field's.
+    """
+    scan = images(tmp_path / "scan", grey(exposure=scale))
+    options = {"flat": FLAT, "dark": DARK, "find_bad_pixels": False}
+    if exposure is not None:
+        options["exposure"] = tmp_path / "exposures.txt"
+        options["exposure"].write_text("\n".join([str(exposure)] * VIEWS))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        opened(scan, **options).whole()
+    assert ["less than a tenth as bright" in str(one.message) for one in caught] == [True] * warned
+
+
+@pytest.mark.parametrize("option", ["flat", "dark", "saturation"])
+def test_options_of_light_are_refused_for_line_integrals(option, tmp_path):
+    """Dark and flat fields, as exposures, would not be used; a dark field of 0 changes nothing."""
+    path = array(tmp_path / "a.npy", BODY.astype("f4"))
+    opened(path, kind="integrals", dark=0)
+    for kind in ("integrals", "counts"):
+        with pytest.raises(Refused, match=f"expected intensities for views.{option}, got {kind}"):
+            opened(path, kind=kind, **{option: 100.0})
+
+
+def test_a_white_level_of_nikon_is_the_flat_field_of_other_views(scan, tmp_path):
+    """A header that is given as flat field: its number, not the mean of its images."""
+    (tmp_path / "nikon").mkdir()
+    sizes = {"DetectorPixelsX": COLUMNS, "DetectorPixelsY": ROWS, "Projections": VIEWS}
+    path = xtekct(tmp_path / "nikon", WhiteLevel=FLAT, **sizes)
+    images(tmp_path / "nikon", grey(body=BODY + 0.4), "tooth_{}.tif")
+    found = opened(scan, dark=DARK, flat=str(path), find_bad_pixels=False).whole().views
+    assert np.abs(found.numpy() - BODY).max() < 1e-3
