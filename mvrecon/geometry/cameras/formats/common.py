@@ -22,7 +22,7 @@ from mvrecon.core.files.checks import (
     shown,
     text_of,
 )
-from mvrecon.core.files.keys import IMAGE_EFFECTS, mentions, warn_of_unknown
+from mvrecon.core.files.keys import IMAGE_EFFECTS, has_effect, warn_of_unknown
 from mvrecon.core.parts import CAMERAS, CameraPart
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.camera import Cameras
@@ -245,9 +245,11 @@ def _column(
         )
     if found[0]:
         _check_lines(path, names[0], [row[0] for row in rows])
-    others = [name for k, name in enumerate(names) if k != found[0] and mentions(name, TURNS)]
+    others = [name for k, name in enumerate(names) if k != found[0] and has_effect(name, "", TURNS)]
     name = names[found[0]] if names else title
-    said = [text for text in dict.fromkeys((name, title)) if mentions(text, {CLOCKWISE: None})]
+    said = [
+        text for text in dict.fromkeys((name, title)) if has_effect(text, "", {CLOCKWISE: None})
+    ]
     warn_of_unknown(path, [*said, *others])
     numbers = [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
     return name, numbers
