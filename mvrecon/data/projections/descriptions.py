@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from mvrecon.core.files.checks import MILLIMETRES, Refused, millimetres, shown
-from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, has_effect, mentions
+from mvrecon.core.files.checks import Refused, millimetres, shown
+from mvrecon.core.files.keys import Key
+from mvrecon.core.files.prose import LINE, statements
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -78,7 +79,7 @@ KEYS = (
 )
 #: Entries that are known, by the name of a program.
 KNOWN = [name.split(": ", 1) for key in KEYS for name in key.names]
-#: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
+#: The root of OME's description, an attribute of its elements, and a number of Dectris.
 OME, ATTRIBUTE = re.compile(r"<(\w+:)?OME\b"), re.compile(r"([\w-]+)\s*=\s*[\"']([^\"']*)[\"']")
 #: Parts of OME's description that may quote its elements: comments, and what other programs wrote.
 QUOTED = re.compile(
@@ -90,42 +91,7 @@ QUOTED = re.compile(
 OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 #: An element of OME's description that says which page of a file is which image.
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
-LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
-#: Entries of any text: a name, `=`, `:`, a tabulator or a blank before a number, and a word or a
-#: list; and elements of XML.
-ENTRY = re.compile(
-    r"(?<!\w)([A-Za-z_][\w .()/-]{0,60}?)(?:[\"']?[ ]*[:=\t][ \t]*[\"']?|[ ]+(?=[-+]?\.?\d))"
-    r"(?=(\[[^\]]{1,200}\]|\([^)]{1,200}\)|[^\s\"',;<>}\])]+))"
-)
-ELEMENT = re.compile(r"<([\w:.-]{1,60})(?:\s[^<>]{0,200})?>\s*([^<>\s][^<>]{0,200})</")
-NAMED = re.compile(
-    r"\b(?:name|key)\s*=\s*[\"']([^\"'<>]{1,60})[\"'][^<>]{0,200}?(?:value\s*=\s*[\"']|>\s*)"
-    r"([^\"'<>]{1,200})"
-)
-PAIR = re.compile(r"<(?:name|key)>\s*([^<>]{1,60}?)\s*</\w+>\s*<[\w:.-]{1,60}>\s*([^<>]{1,200})</")
-#: Characters of a line of prose that are named, and words by which it states what was done to grey
-#: values.
-PROSE_SHOWN = 80
-PROSE = re.compile(
-    r"(?<![<\w])(scaled|multiplied|divided|subtract(ed|ion)|correct(ed|ion)|normali[sz](ed|ation)|"
-    r"flipped|mirrored|rotated|transposed|inverted|lineari[sz]ed|logarithms?|"
-    r"log.transform(ed)?|optical densit(y|ies)|(ln|log(10|2|e)?) ?\()\b",
-    re.IGNORECASE,
-)
-#: Names of scales of the display, of stages and lenses; and units of other things than values.
-OF_DISPLAY = re.compile(
-    r"spatial|^stage|zoom|magnif|auto.?scale|scale.?bar|display|look.?up|pixel.?(size|spacing)|"
-    r"(?<![a-z])(date|time)(?=\W*$|.?(unit|scale))",
-    re.IGNORECASE,
-)
-OTHER_UNITS = {
-    *MILLIMETRES,
-    *("count", "counts", "adu", "dn", "pixel", "pixels", "px", "inch", "in"),
-    *("s", "sec", "ms", "us"),
-    *("deg", "degrees", "rad"),
-    *("v", "kv", "kev", "ev", "ma", "ua", "a", "w", "c", "k", "bit", "bits"),
-}
 #: A comma between thousands.
 THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
@@ -139,37 +105,13 @@ def without_own_id(text: str) -> str:
 
 @lru_cache(maxsize=32)
 def effects(text: str) -> list[str]:
-    """Names of the entries of a text that may change values: lines of a name and a value, JSON,
-    XML; and the starts of lines of prose with a word of `PROSE`. None of OME's and MetaMorph's
-    texts, whose entries are of the display and the microscope.
+    """What `statements` finds in a text but for entries that are known by their program; nothing in
+    OME's and MetaMorph's, whose entries are of the display and the microscope.
     """
     if OME.search(text) or text.startswith("<MetaData"):
         return []
     known = {name for program, name in KNOWN if program == "Dectris" or program in text}
-    lines = LINE.sub("", text).splitlines()
-    parts = [(x, ENTRY.findall(x) if mentions(x, IMAGE_EFFECTS) else []) for x in lines]
-    found = [pair for _, pairs in parts for pair in pairs]
-    for pattern in (LINE, ELEMENT, NAMED, PAIR):
-        found += pattern.findall(text)
-    prose = {
-        line.strip()[:PROSE_SHOWN]
-        for line, pairs in parts
-        if PROSE.search(line) and not any(mentions(name, IMAGE_EFFECTS) for name, _ in pairs)
-    }
-    return sorted(
-        prose
-        | {
-            name.strip()
-            for name, value in found
-            if name.strip() not in known
-            and not OF_DISPLAY.search(name)
-            and any(
-                has_effect(name, part.rstrip("xX"), IMAGE_EFFECTS)
-                and part.lower() not in OTHER_UNITS
-                for part in re.findall(r"[^\s,;()\[\]]+", value)
-            )
-        }
-    )
+    return [name for name in statements(text) if name not in known]
 
 
 @lru_cache(maxsize=4)
