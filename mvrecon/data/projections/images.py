@@ -105,6 +105,7 @@ class ImageFiles(ProjectionStack):
         self.files, self.excluded = list(files), headers[0].excluded
         self.pixel_mm = headers[0].pixel_mm
         self.unknown = [name for head in headers for name in head.unknown]
+        self.units = ", ".join(sorted({head.units for head in headers} - {""}))
         self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,
