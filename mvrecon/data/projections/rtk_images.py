@@ -109,7 +109,10 @@ XIM_KEYS = (
 VARIAN_KEYS = (
     Key("SizeX, SizeY", "applied", "(rows - 1) x columns must be a multiple of 4 in .hnd and .xim"),
     Key("dIDUResolutionX, dIDUResolutionY", "applied", "the pixel size in mm"),
-    Key("dCTNormChamber", "ignored", "give it as views.exposure where it changes"),
+    Key("dCTNormChamber", "compared", "of views and flat fields, as an exposure"),
+    Key("dXRayMA", "compared", "as XRayTubeCurrent, where there is no dCTNormChamber"),
+    Key("dXRayKV", "compared", "of views and flat fields; warned of"),
+    Key("nPixelOffset", "ignored", "but for a warning, unless 0"),
     Key("dCTProjectionAngle, dSAD, dSFD, dIDUPosLat", "ignored", "the camera decides"),
 )
 #: Most bytes of the header of an EDF, which is a multiple of `EDF_BLOCK`.
@@ -134,6 +137,8 @@ def rtk_header(file: Path) -> Header:
         _check_his(file)
     elif form == "XIM":
         stated, unknown = _check_xim(file)
+    else:
+        stated, unknown = _of_varian(file)
     reader = _reader(file)
     reader.UpdateOutputInformation()
     columns, rows, pages = size = tuple(reader.GetOutput().GetLargestPossibleRegion().GetSize())
@@ -254,6 +259,17 @@ def _check_xim(file: Path) -> tuple[dict[str, list[str]], list[str]]:
     others = unknown_names(own, XIM_KEYS)
     unknown = [name for name in others if has_effect(name, own[name], IMAGE_EFFECTS)]
     return stated, unknown + said([("AcquisitionNotes", own.get("AcquisitionNotes", ""))])
+
+
+def _of_varian(file: Path) -> tuple[dict[str, list[str]], list[str]]:
+    """Exposure and beam that the header of .hnc and .hnd states, none of 0, and an offset."""
+    with file.open("rb") as raw:
+        head = raw.read(512)
+    voltage, current, *_, chamber = struct.unpack_from("<6d", head, 400)
+    own = {"dXRayKV": voltage}
+    own |= {"dCTNormChamber": chamber} if chamber else {"XRayTubeCurrent": current}
+    stated = {name: [f"{value:.9g}"] for name, value in own.items() if value}
+    return stated, ["nPixelOffset"] * any(head[160:164])
 
 
 def _xim_properties(file: Path) -> dict[str, str]:

@@ -309,6 +309,25 @@ def test_a_flat_field_of_another_exposure_of_xim_is_warned_of_and_applied_by_its
     np.testing.assert_allclose(found.numpy(), -np.log(values / 20_000), atol=1e-5)
 
 
+@pytest.mark.parametrize("write", [hnc, hnd])
+def test_what_the_header_of_varians_obi_states_of_the_light_is_compared(write, tmp_path):
+    """The chamber's reading, else the current; the 30th, 31st and 35th of its numbers."""
+    path = tmp_path / f"a.{write.__name__}"
+    write(path, grey(60_000)[0])
+    head = bytearray(path.read_bytes())
+    path.write_bytes(head)
+    assert rtk_images._of_varian(path) == ({}, [])
+    struct.pack_into("<2d", head, 168 + 29 * 8, 110.0, 20.0)
+    path.write_bytes(head)
+    stated = {"dXRayKV": ["110"], "XRayTubeCurrent": ["20"]}
+    assert rtk_images._of_varian(path) == (stated, [])
+    struct.pack_into("<d", head, 168 + 34 * 8, 1234.5)
+    struct.pack_into("<I", head, 160, 7)
+    path.write_bytes(head)
+    stated = {"dXRayKV": ["110"], "dCTNormChamber": ["1234.5"]}
+    assert rtk_images._of_varian(path) == (stated, ["nPixelOffset"])
+
+
 def test_how_cameras_turned_images_and_the_title_of_edf_are_searched(tmp_path):
     path, values = tmp_path / "a.edf", grey(20_000)[0].astype("u2")
     edf(path, values, image_flip="<flip x : True>", energy=20, title="knee 3")
