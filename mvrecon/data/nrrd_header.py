@@ -44,7 +44,7 @@ NRRD_KEYS = (
     Key(
         "sample units",
         "refused",
-        "of volumes: convert the values; those of views are compared with their kind",
+        "convert the values; units of views are compared with their kind",
         ("HU", "hounsfield", "hounsfield units", "1/mm", "mm^-1", "counts", "activity", "unknown"),
     ),
     Key("axis mins", "applied", "beside spacings, by centerings"),
