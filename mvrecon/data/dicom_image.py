@@ -172,7 +172,7 @@ DERIVED = (
         "compared",
         "with compression; a warning names other derivations",
     ),
-    Key(", ".join(TEXTS), "ignored", SAID),
+    Key(", ".join(TEXTS[:2]), "ignored", SAID),  # the third is also compared, of projections
 )
 #: Sequences of functional groups that describe other images.
 OTHERS = re.compile("Referenced|Source|Derivation|Contributing|Original|ConversionSource")
