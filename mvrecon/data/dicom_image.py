@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, file_errors, io_library, shown
-from mvrecon.core.files.keys import Key, check_keys, has_effect
+from mvrecon.core.files.keys import SAID, Key, check_keys, has_effect
+from mvrecon.core.files.prose import said
 
 #: Endings of DICOM files; others are recognised by the bytes from 128 on, or, without these, by a
 #: short element of the group 2 or 8 at their beginning: with a type of two letters, or a length.
@@ -160,6 +161,19 @@ EFFECTS = {
     r"(decay|scatter|attenuation)\b.* flag": 0,
     r"decay correction$": "NONE",
 }
+#: Attributes of free text that may say how values were derived.
+TEXTS = ("ImageComments", "FrameComments", "AcquisitionDeviceProcessingDescription")
+#: Derivations that change no values beyond a codec's errors.
+COMPRESSED = re.compile("compress|jpeg|encod", re.IGNORECASE)
+#: Attributes of X-ray images and of measured counts that say how values were derived.
+DERIVED = (
+    Key(
+        "DerivationDescription, DerivationCodeSequence",
+        "compared",
+        "with compression; a warning names other derivations",
+    ),
+    Key(", ".join(TEXTS[:2]), "ignored", SAID),  # the third is also compared, of projections
+)
 #: Sequences of functional groups that describe other images.
 OTHERS = re.compile("Referenced|Source|Derivation|Contributing|Original|ConversionSource")
 
@@ -324,6 +338,16 @@ class DicomImage:
                     raise Refused(
                         f"{self.path}: expected {expected}, got {name} with {', '.join(wrong)}"
                     )
+
+    def derived(self) -> list[str]:
+        """How the image says that its values were derived, but by compression, and what its
+        comments state of them.
+        """
+        texts = [str(text) for _, text in self.stated("DerivationDescription")]
+        codes = [code for _, items in self.stated("DerivationCodeSequence") for code in items]
+        texts += [str(code.get("CodeMeaning", "")) for code in codes]
+        found = [f"derivation {text!r}" for text in texts if text and not COMPRESSED.search(text)]
+        return found + said((name, str(text)) for name in TEXTS for _, text in self.stated(name))
 
     def private(self) -> list[str]:
         """Private attributes with a name of pydicom's dictionary by which they may change the

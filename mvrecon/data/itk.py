@@ -33,7 +33,8 @@ TYPES = {
 
 class ItkImage(NamedTuple):
     """An image with a checked header: pixels along (x, y, z), their type, the affine from index to
-    ITK's world in mm, and the number of axes in the file; those beyond three have one pixel.
+    ITK's world in mm, the number of axes in the file, of which those beyond three have one pixel,
+    and the unit that it states of the values, "" of none.
     """
 
     path: Path
@@ -41,6 +42,7 @@ class ItkImage(NamedTuple):
     dtype: np.dtype
     affine: np.ndarray
     axes: int
+    unit: str
 
     def read(self, first: int, last: int) -> np.ndarray:
         """Read the planes `first` to `last - 1` along z, as [z y x]."""
@@ -54,12 +56,12 @@ class ItkImage(NamedTuple):
         return values.reshape(last - first, *self.size[1::-1])
 
 
-def itk_image(path: Path, least: int = 3) -> ItkImage:
+def itk_image(path: Path, views: bool = False) -> ItkImage:
     """Read the header of an image of three axes, checked against the file's size.
 
     Args:
         path: path of the file.
-        least: number of axes; 2 accepts an image of one plane.
+        views: accept an image of one plane, and a third axis without lengths.
 
     Raises:
         ImportError: SimpleITK is not installed.
@@ -71,7 +73,7 @@ def itk_image(path: Path, least: int = 3) -> ItkImage:
     with path.open("rb") as file:
         text = file.read(HEADER).decode("latin-1")
     nrrd = IO[path.suffix.lower()] == "NrrdImageIO"
-    header = nrrd_header(path, text) if nrrd else meta_header(path, text)
+    header = nrrd_header(path, text, views) if nrrd else meta_header(path, text)
     reader = _reader(path)
     with checks.file_errors(path, "cannot be read"):
         reader.ReadImageInformation()
@@ -80,7 +82,7 @@ def itk_image(path: Path, least: int = 3) -> ItkImage:
         scalar = kind.removeprefix("vector of ") if reader.GetNumberOfComponents() == 1 else kind
         direction = np.reshape(reader.GetDirection(), (len(size), len(size)))
         mixed = direction[3:, :3].any() or direction[:3, 3:].any()
-        if len(size) < least or {*size[3:]} - {1} or mixed or scalar not in TYPES:
+        if len(size) < 3 - views or {*size[3:]} - {1} or mixed or scalar not in TYPES:
             raise checks.Refused(
                 f"{path}: expected three axes and one number per voxel, got {size} of {kind}"
             )
@@ -94,7 +96,7 @@ def itk_image(path: Path, least: int = 3) -> ItkImage:
         affine[:n, 3] = reader.GetOrigin()[:n]
         affine[:3] *= header.mm
         check_even(path, header, float(np.linalg.norm(affine[:3, 2])))
-    return ItkImage(path, size, dtype, affine, len(direction))
+    return ItkImage(path, size, dtype, affine, len(direction), header.unit)
 
 
 def open_itk(path: str | Path) -> tuple[Slabs, Grid]:

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.core.files import checks
-from mvrecon.core.files.keys import EFFECTS, Key, check_keys, check_unknown
+from mvrecon.core.files.keys import EFFECTS, SAID, Key, check_keys, check_unknown
+from mvrecon.core.files.prose import said
 
 #: Maximum bytes of a header.
 HEADER = 2**16
@@ -24,6 +25,8 @@ NO_UNIT = ("", "?")
 #: ITK's key, of an image that it joined of slices, for the largest difference of their distances
 #: from the spacing, and the share of the spacing from which it is a gap, as in a DICOM series.
 UNEVEN, GAP = "ITK_non_uniform_sampling_deviation", 0.01
+#: DICOM's DerivationDescription and ImageComments.
+COPIED_TEXTS = ("0008|2111", "0020|4000")
 #: Keys of other formats that ITK copies into MetaImage, and into NRRD as key/value pairs.
 COPIED = (
     Key(
@@ -31,6 +34,10 @@ COPIED = (
         "compared",
         f"with the spacing: refused beyond {GAP:.0%} of it, as slices of a series were missing",
     ),
+    Key("0028|1040", "refused", "DICOM's PixelIntensityRelationship", ("LIN",)),
+    Key("0028|1041", "refused", "DICOM's PixelIntensityRelationshipSign", (1,)),
+    Key("0028|1054", "refused", "DICOM's RescaleType", ("HU", "US", "BQML")),
+    Key(", ".join(COPIED_TEXTS), "ignored", SAID),
     Key(
         "????|????, scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, "
         "bitpix, vox_offset, nifti_type, qform_code*, sform_code*, qfac, qoffset_*, quatern_*, "
@@ -48,6 +55,8 @@ COPIED = (
         "of 3D Slicer and MITK",
     ),
 )
+#: Free texts of MetaImage.
+META_TEXTS = ("Comment", "Name")
 #: Keys of MetaImage (.mha, .mhd), all applied by ITK but where noted. ITK ignores one whose name
 #: differs in case or spaces.
 META_KEYS = (
@@ -88,10 +97,11 @@ META_KEYS = (
         "LOCAL, or one file in the header's folder or below; no LIST or pattern",
     ),
     Key(
-        "ElementMin, ElementMax, SequenceID, Comment, Name, ID, ParentID, Color, AcquisitionDate",
+        "ElementMin, ElementMax, SequenceID, ID, ParentID, Color, AcquisitionDate",
         "ignored",
         "statistics and origin",
     ),
+    Key(", ".join(META_TEXTS), "ignored", SAID),
     Key("ObjectSubType, TransformType", "ignored", "of other objects than images"),
     *COPIED,
 )
@@ -136,7 +146,7 @@ TRUTH = {"true": True, "t": True, "1": True, "false": False, "f": False, "0": Fa
 class Header(NamedTuple):
     """A checked header: the file of the values, their first byte in it, their encoding, the bytes
     to skip once they are decoded (-1: all but the last ones), the unit of length in mm, the bytes
-    of compressed values, if stated, and the text of `UNEVEN`.
+    of compressed values, if stated, the text of `UNEVEN`, and the unit of the values, "" of none.
     """
 
     data: Path
@@ -146,6 +156,7 @@ class Header(NamedTuple):
     mm: float
     packed: int | None = None
     uneven: str = "0"
+    unit: str = ""
 
 
 def meta_header(path: Path, text: str) -> Header:
@@ -231,7 +242,8 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
         raise checks.Refused(
             f"{path}: expected ElementDataFile last, got {hidden[0]} behind it, which ITK ignores"
         )
-    check_unknown(path, pairs + behind, META_KEYS, META_EFFECTS)
+    texts = [(name, value) for name, value in pairs if name in (*META_TEXTS, *COPIED_TEXTS)]
+    check_unknown(path, pairs + behind, META_KEYS, META_EFFECTS, said(texts))
     return entries, place
 
 

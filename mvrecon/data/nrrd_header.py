@@ -5,9 +5,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mvrecon.core.files import checks
-from mvrecon.core.files.keys import Key, check_keys, check_unknown, warn_of_unknown
+from mvrecon.core.files.keys import SAID, Key, check_keys, check_unknown, warn_of_unknown
+from mvrecon.core.files.prose import said
 from mvrecon.data.itk_headers import (
     COPIED,
+    COPIED_TEXTS,
     HEADER,
     META_EFFECTS,
     UNEVEN,
@@ -42,7 +44,7 @@ NRRD_KEYS = (
     Key(
         "sample units",
         "refused",
-        "convert the values",
+        "convert the values; units of views are compared with their kind",
         ("HU", "hounsfield", "hounsfield units", "1/mm", "mm^-1", "counts", "activity", "unknown"),
     ),
     Key("axis mins", "applied", "beside spacings, by centerings"),
@@ -54,10 +56,15 @@ NRRD_KEYS = (
         "applied",
         "of axis mins: node, or else half a voxel before its centre",
     ),
-    Key("kinds", "compared", "an axis of time is refused unless of one voxel: it has no length"),
+    Key(
+        "kinds",
+        "compared",
+        "an axis of time is refused unless of one voxel, or that of views: it has no length",
+    ),
     Key("data file", "refused", "its values in the same file"),
     Key("measurement frame", "ignored", "of vectors"),
-    Key("number, content, labels", "ignored", "repeated by sizes, and texts"),
+    Key("content", "ignored", SAID),
+    Key("number, labels", "ignored", "repeated by sizes, and texts"),
     Key("min, max, thicknesses", "ignored", "statistics, and extent of a voxel"),
     *COPIED,
 )
@@ -65,12 +72,18 @@ NRRD_KEYS = (
 FIELDS = {name.replace(" ", "") for key in NRRD_KEYS if key not in COPIED for name in key.names}
 
 
-def nrrd_header(path: Path, text: str) -> Header:
+def nrrd_header(path: Path, text: str, views: bool = False) -> Header:
+    """Check the header of a volume, or of views, whose third axis has no length and whose unit is
+    that of their kind.
+    """
     entries, first = _nrrd_entries(path, text)
-    check_keys(path, NRRD_KEYS, lambda key: _word(entries, key))
-    _check_places(path, entries)
+    lengths, unit = 2 if views else 3, _word(entries, "sample units")
+    keys = [key for key in NRRD_KEYS if not (views and key.name == "sample units")]
+    check_keys(path, keys, lambda key: _word(entries, key))
+    _check_places(path, entries, lengths)
     kinds, sizes = (entries.get(name, "").lower().split() for name in ("kinds", "sizes"))
-    if any(kind == "time" and size != "1" for kind, size in zip(kinds, sizes, strict=False)):
+    timed = {n for n, kind in enumerate(kinds) if kind == "time"} - ({2} if views else set())
+    if any(size != "1" for n, size in enumerate(sizes) if n in timed):
         raise checks.Refused(f"{path}: expected kinds of lengths, got {entries['kinds']}")
     lines, skip = (_whole(path, entries, name, 0) for name in ("line skip", "byte skip"))
     raw, encoding = text.encode("latin-1"), entries.get("encoding", "raw").lower()
@@ -84,11 +97,12 @@ def nrrd_header(path: Path, text: str) -> Header:
         if first == 0:
             raise checks.Refused(f"{path}: expected {lines} lines to skip, got fewer")
     units = [entries.get(name, "") for name in ("units", "spaceunits")]
-    quoted = [unit for text in units for unit in re.findall(r'"([^"]*)"', text)]
+    quoted = [unit for text in units for unit in re.findall(r'"([^"]*)"', text)[:lengths]]
     mm = unit_of_length(path, quoted or [""], "units and space units")
     names = {"raw": "raw", "gz": "gzip", "gzip": "gzip", "hex": "hex"}
     uneven = entries.get(UNEVEN, "0")
-    return Header(path, first, names.get(encoding, "text"), skip, mm, uneven=uneven)
+    encoding = names.get(encoding, "text")
+    return Header(path, first, encoding, skip, mm, uneven=uneven, unit=unit)
 
 
 def _word(entries: Mapping[str, str], key: str) -> str:
@@ -121,8 +135,11 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
             pairs.append((line.partition(":=")[0], line.partition(":=")[2]))
     alike = [pair for pair in pairs if pair[0].lower().replace(" ", "") in FIELDS]
     warn_of_unknown(path, [f"{name}:=" for name, _ in alike])  # no fields, whatever their names
-    check_unknown(path, [pair for pair in pairs if pair not in alike], NRRD_KEYS, META_EFFECTS)
-    entries |= {name: value.strip() for name, value in pairs if name == UNEVEN}
+    texts = [("content", entries.get("content", "")), *(p for p in pairs if p[0] in COPIED_TEXTS)]
+    texts += [("#", line[1:]) for line in lines[1:count] if line.startswith("#")]
+    others = [pair for pair in pairs if pair not in alike]
+    check_unknown(path, others, NRRD_KEYS, META_EFFECTS, said(texts))
+    entries |= {name: value.strip() for name, value in pairs if name == UNEVEN or "|" in name}
     return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
 
 
@@ -134,8 +151,10 @@ def _whole(path: Path, entries: Mapping[str, str], key: str, default: int) -> in
     return int(text)
 
 
-def _check_places(path: Path, entries: Mapping[str, str]) -> None:
-    """Check the numbers of an NRRD's places: ITK ignores those that are not finite."""
+def _check_places(path: Path, entries: Mapping[str, str], lengths: int) -> None:
+    """Check the numbers of an NRRD's places along the first axes, which have lengths: ITK ignores
+    those that are not finite.
+    """
     directions, spacings = entries.get("spacedirections"), entries.get("spacings", "")
     axes = int(entries.get("spacedimension", 3))  # one of those in NRRD_KEYS
     count = _whole(path, entries, "dimension", 3)
@@ -151,17 +170,17 @@ def _check_places(path: Path, entries: Mapping[str, str]) -> None:
                 f"{path}: expected {name} of {vectors} vectors of {axes} finite numbers, got "
                 f"{checks.shown(text)}"
             )
-    expected = 0 if directions is not None else min(3, count)
-    found = [value for value in finite(spacings.split()) if value]
-    words = [word for word in spacings.lower().split() if word != "nan"]
+    expected = 0 if directions is not None else min(lengths, count)
+    found = [value for value in finite(spacings.split()[:lengths]) if value]
+    words = [word for word in spacings.lower().split()[:lengths] if word != "nan"]
     if spacings and (len(found) != expected or len(words) != expected):
         raise checks.Refused(
             f"{path}: expected {expected or 'no'} finite spacings"
             f"{' beside space directions' if directions else ''}, got {checks.shown(spacings)}"
         )
-    mins = [word for word in entries.get("axismins", "").lower().split() if word != "nan"]
+    mins = [word for word in entries.get("axismins", "").lower().split() if word != "nan"][:lengths]
     if mins and not len(finite(mins)) == len(mins) == len(found):
         raise checks.Refused(
-            f"{path}: expected axis mins of 3 finite numbers beside spacings, got "
+            f"{path}: expected axis mins of {lengths} finite numbers beside spacings, got "
             f"{checks.shown(entries['axismins'])}; state the first voxel's place as space origin"
         )

@@ -17,6 +17,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import Refused, millimetres, shown
 from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, has_effect, unknown_entries
+from mvrecon.core.files.prose import LINE, statements
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -119,7 +120,7 @@ MARKS = {
     "Dectris": r"^# ",
     "tifffile": r"^\{\"shape\": ",
 }
-#: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
+#: The root of OME's description, an attribute of its elements, and a number of Dectris.
 OME, ATTRIBUTE = re.compile(r"<(\w+:)?OME\b"), re.compile(r"([\w-]+)\s*=\s*[\"']([^\"']*)[\"']")
 #: Parts of OME's description that may quote its elements: comments, and what other programs wrote.
 QUOTED = re.compile(
@@ -131,18 +132,7 @@ QUOTED = re.compile(
 OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 #: An element of OME's description that says which page of a file is which image.
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
-LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
-#: A value in an element of XML, an object within one of JSON, and where a text divides: lines,
-#: parts of lists, elements.
-ELEMENT = re.compile(r"<([\w:.-]+)[^<>]*>\s*([^<>\s][^<>]*)</")
-OBJECT = re.compile(r"\"\s*:\s*\{\s*\"")
-PART = re.compile(r"[\n\r;<>{}]|,(?=\s*[\"'[])|,(?=\s*[^\W\d][\w .-]{0,60}[:=])")
-#: An entry, a name and a value; and the name of another within its value.
-ENTRY = re.compile(r"([^\W\d][^:=\t\"']*?)[\"']?\s*[:=\t]\s*(.*)")
-INNER = re.compile(r"[^\W\d][\"']?\s*[:=]")
-#: Characters of a part of a text that are named.
-PART_SHOWN = 80
 #: A comma between thousands.
 THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
@@ -156,28 +146,14 @@ def without_own_id(text: str) -> str:
 
 @lru_cache(maxsize=32)
 def unknown_parts(text: str) -> list[str]:
-    """What a text states beside the entries of `KEYS`: the names of its other entries (lines of a
-    name and a value, JSON, XML), and other lines with words; but no entry whose value is zero,
-    empty or a word such as "off". OME's and MetaMorph's texts have no such parts.
+    """What a text states beside the entries of `KEYS`; but no entry whose value is zero, empty or a
+    word such as "off", and nothing of OME's and MetaMorph's texts.
     """
     if OME.search(text) or text.startswith("<MetaData"):
         return []
     program = next((name for name, mark in MARKS.items() if re.search(mark, text, re.M)), "text")
-    stated, names = {}, {}
-    lines = ELEMENT.sub(r"\n\1: \2\n<", LINE.sub(r"\1: \2", text))
-    for part in PART.split(OBJECT.sub(".", lines)):
-        plain = part.strip(" \t,[]()#*\"'")
-        entry = ENTRY.fullmatch(plain)
-        name, value = entry.groups() if entry else (plain, plain)
-        if not (entry or re.search(r"[^\W\d]{2}", name)) or part.startswith(("/", "?", "!")):
-            continue
-        value = re.sub(r"[\s,\"'()[\]]+", " ", value)
-        brief = plain if INNER.search(value) else name
-        key = f"{program}: {name}"
-        key = key if stated.get(key, value) == value else f"{program}: {plain}"
-        stated[key] = value
-        names[key] = brief if len(brief) <= PART_SHOWN else f"{brief[:PART_SHOWN]}..."
-    return [names[key] for key in unknown_entries(stated, KEYS)]
+    stated = {f"{program}: {part}": value for part, value in statements(text).items()}
+    return [name.removeprefix(f"{program}: ") for name in unknown_entries(stated, KEYS)]
 
 
 @lru_cache(maxsize=4)

@@ -2,7 +2,6 @@
 pydicom: the extra `io`.
 """
 
-import re
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import Refused, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.dicom_image import ONE_FILE, DicomImage
+from mvrecon.data.dicom_image import DERIVED, ONE_FILE, DicomImage
 from mvrecon.data.dicom_pixels import pixels_of, scales_of, stored_type
 from mvrecon.data.projections import exposures
 from mvrecon.data.projections.stack import Header
@@ -24,8 +23,8 @@ ALIKE = (
     "IntensifierActiveDimensions CassetteOrientation XRayImageReceptorTranslation "
     "XRayImageReceptorAngle RTImagePlane RTImageOrientation RTImagePosition"
 ).split()
-#: Attributes of DICOM projections that change grey values, but not in proportion; the last two
-#: lines are of DICOM-CT-PD.
+#: Attributes of DICOM projections that change grey values, but not in proportion, or may have been
+#: stored in another way; those from SourceIndex on are of DICOM-CT-PD.
 BEAM = (
     "KVP AnodeTargetMaterial FocalSpots RectificationType HalfValueLayer XRayOutput RadiationMode "
     "RadiationSetting ExposureStatus Sensitivity DetectorMode DetectorType DetectorID "
@@ -34,9 +33,10 @@ BEAM = (
     "LinearityCorrectionTechnique BeamHardeningCorrectionTechnique FilterMaterial FilterType "
     "TypeOfFilters FilterThicknessMinimum FilterThicknessMaximum FilterBeamPathLengthMinimum "
     "FilterBeamPathLengthMaximum Grid GridID GridAbsorbingMaterial GridSpacingMaterial "
-    "GridThickness GridPitch GridPeriod GridAspectRatio GridFocalDistance SourceIndex "
-    "SpectrumIndex BeamHardeningCorrectionFlag GainCorrectionFlag DarkFieldCorrectionFlag "
-    "FlatFieldCorrectionFlag BadPixelCorrectionFlag ScatterCorrectionFlag"
+    "GridThickness GridPitch GridPeriod GridAspectRatio GridFocalDistance "
+    "PhotometricInterpretation SourceIndex SpectrumIndex BeamHardeningCorrectionFlag "
+    "GainCorrectionFlag DarkFieldCorrectionFlag FlatFieldCorrectionFlag BadPixelCorrectionFlag "
+    "ScatterCorrectionFlag"
 ).split()
 #: Changes of the table's place from the first frame on, a number for each frame.
 STEPS = ["TableVerticalIncrement", "TableLateralIncrement", "TableLongitudinalIncrement"]
@@ -91,17 +91,12 @@ NO_PROJECTIONS = {
         ).split()
     },
 }
-#: Derivations that change no values beyond a codec's errors.
-COMPRESSED = re.compile("compress|jpeg|encod", re.IGNORECASE)
 #: All that are compared between views with a warning.
 COMPARED = (*exposures.DICOM, *BEAM, *CAMERA_PLACES, *OBJECT_PLACES)
 #: Attributes of DICOM projections besides `dicom_image.KEYS`.
 DICOM_KEYS = (
-    Key(
-        "DerivationDescription, DerivationCodeSequence",
-        "compared",
-        "with compression; a warning names other derivations",
-    ),
+    *DERIVED,
+    Key("MeasurementUnitsCodeSequence, Units", "compared", "with the kind of the views"),
     Key(
         "PixelIntensityRelationship",
         "refused",
@@ -256,7 +251,8 @@ def dicom_header(file: Path) -> Header:
         tuple(map(image.value, ALIKE)),
         {name: _texts(image, name) for name in COMPARED},
         image.value("PixelIntensityRelationship") == "LIN",
-        unknown=[*image.private(), *_derivations(image)],
+        unknown=[*image.private(), *image.derived()],
+        units=", ".join(sorted(unit.strip("{}") for unit in image.units())),
         angles=_angles(image),
     )
 
@@ -278,15 +274,6 @@ def _angles(image: DicomImage) -> list[float]:
             return [float(angle + step) for angle, step in zip(angles, steps, strict=True)]
         return [float(angle) for angle in angles]
     return []
-
-
-def _derivations(image: DicomImage) -> list[str]:
-    """How the image says that its values were derived, but by compression."""
-    texts = [str(text) for _, text in image.stated("DerivationDescription")]
-    codes = [code for _, items in image.stated("DerivationCodeSequence") for code in items]
-    texts += [str(code.get("CodeMeaning", "")) for code in codes]
-    derived = [text for text in texts if text and not COMPRESSED.search(text)]
-    return [f"derivation {text!r}" for text in derived]
 
 
 def _texts(image: DicomImage, name: str) -> list[str]:

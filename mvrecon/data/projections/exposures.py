@@ -33,6 +33,8 @@ DICOM = {
 DECTRIS = {"Filter_transmission": "share"}
 #: Among the counters of an EDF, the current of the ESRF's storage ring.
 EDF = {"srcur": "rate"}
+#: In a .xim, .hnd or .hnc of Varian, the reading of the chamber behind the tube.
+VARIAN = {"KVNormChamber": "vague", "dCTNormChamber": "vague"}
 #: In an entry of NeXus, and in its detector.
 MONITORS = {
     "control/data": "vague",
@@ -51,7 +53,7 @@ DETECTOR = {
 EXCHANGE = "exposure_time"
 #: Of each attenuator in an instrument of NeXus, behind the path of its group.
 ATTENUATOR = "attenuator_transmission"
-KINDS = {**DICOM, **DECTRIS, **EDF, **MONITORS, **DETECTOR}
+KINDS = {**DICOM, **DECTRIS, **EDF, **VARIAN, **MONITORS, **DETECTOR}
 NAME = "|".join([*map(re.escape, KINDS), rf"[\w./-]+/{ATTENUATOR}"])
 #: One of these names, or several joined by `*`, in the place of a path.
 EXPOSURE_WORDS = re.compile(rf" *({NAME})( *[*] *({NAME}))* *")

@@ -107,6 +107,7 @@ class ImageFiles(ProjectionStack):
         self.unknown = [name for head in headers for name in head.unknown]
         angles = [angle for head in headers for angle in head.angles]
         self.angles = [angles[k] for k in order] if len(angles) == len(order) else ()
+        self.units = ", ".join(sorted({head.units for head in headers} - {""}))
         self._tops = frozenset().union(*(head.tops for head in headers))
         self.detector = {
             "ImagerPixelSpacing": self.pixel_mm,

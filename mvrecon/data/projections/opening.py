@@ -2,9 +2,9 @@
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -216,8 +216,9 @@ def mean_field(
             f"{stack.path}: expected a {name} field of the views' {views.shape} pixels, "
             f"got {stack.shape}"
         )
-    for key, own in views.detector.items():
-        other = stack.detector.get(key)
+    theirs = _detector(stack)
+    for key, own in _detector(views).items():
+        other = theirs.get(key)
         if own is not None and other is not None and not same(own, other):
             raise Refused(
                 f"{stack.path}: expected a {name} field with the {key} {own} of the views, got "
@@ -267,6 +268,15 @@ def _check_alike(
             f"parts of the detector; are views among them, or does the beam move?",
             stacklevel=3,
         )
+
+
+def _detector(stack: ProjectionStack) -> Mapping[str, Any]:
+    """What files state of the detector, by name; of an image with places, also those of its
+    pixels.
+    """
+    if stack.affine is None:
+        return stack.detector
+    return {**stack.detector, "pixel sizes and Offset": stack.affine[:2, [0, 1, 3]].tolist()}
 
 
 def _field(

@@ -5,6 +5,7 @@ Values are RTK's before its logarithm: grey values that rise with intensity. RTK
 .his, 65536 - v, and leaves out its four outer rows and columns.
 """
 
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +14,16 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_declared, io_library
-from mvrecon.core.files.keys import Key, check_keys, unknown_entries
+from mvrecon.core.files.keys import (
+    IMAGE_EFFECTS,
+    SAID,
+    Key,
+    check_keys,
+    has_effect,
+    unknown_entries,
+    unknown_names,
+)
+from mvrecon.core.files.prose import said
 from mvrecon.data.projections.exposures import number_of
 from mvrecon.data.projections.stack import Header
 
@@ -35,8 +45,12 @@ EDF_TYPES = {
 }
 #: Exposure times in s by their names in EDF.
 EDF_TIMES = ("count_time", "ExposureTime", "acq_expo_time")
-#: Parts of the detector, and pixels that form one, by their names in EDF.
-EDF_REGION = tuple("image_bin image_roi col_beg col_end row_beg row_end col_bin row_bin".split())
+#: Parts of the detector, pixels that form one, and how the camera turned them, by their names in
+#: EDF.
+EDF_REGION = tuple(
+    "image_bin image_roi col_beg col_end row_beg row_end col_bin row_bin image_flip "
+    "image_rotation".split()
+)
 EDF_KEYS = (
     Key("Dim_1, Dim_2", "applied"),
     Key("ByteOrder", "applied"),
@@ -49,21 +63,21 @@ EDF_KEYS = (
     Key("Dummy", "refused", "its pixels are bad: replace them, and give views.bad_pixels"),
     Key(", ".join(EDF_TIMES), "compared", "of views and flat fields, as ExposureTime, from s"),
     Key("counter_mne, counter_pos", "compared", "the ring's current srcur, as ExposureTime"),
-    Key(", ".join(EDF_REGION), "compared", "of views and flat fields; warned of"),
+    Key(", ".join((*EDF_REGION, "energy")), "compared", "of views and flat fields; warned of"),
+    Key("title", "ignored", SAID),
     Key("optic_used, PSize_*", "ignored", "the pixel size is asked for"),
     Key("Size, HeaderID, EDF_*, VersionNumber, Image", "ignored", "of the file"),
     Key(
-        "Center_*, SampleDistance, WaveLength, energy, motor_mne, motor_pos",
+        "Center_*, SampleDistance, WaveLength, motor_mne, motor_pos",
         "ignored",
         "the camera decides",
     ),
     Key(
-        "title, run, scan_*, acq_*, point_no, preset, dir, prefix, suffix, date, time, time_of_*, "
+        "run, scan_*, acq_*, point_no, preset, dir, prefix, suffix, date, time, time_of_*, "
         "machine*, cutoffenergy, fill_mode",
         "ignored",
         "of the scan",
     ),
-    Key("image_flip, image_rotation", "ignored", "of the camera, which applied them"),
 )
 HIS_KEYS = (
     Key("FileType, HeaderSize", "applied", "of version 100"),
@@ -72,17 +86,33 @@ HIS_KEYS = (
     Key("TypeOfNumbers", "refused", "unsigned 16-bit numbers", (4,)),
     Key("IntegrationTime", "ignored", "give it as views.exposure where it changes"),
 )
+#: Properties of a .xim on which grey values depend: the names of exposures as in DICOM, and others.
+XIM_EXPOSURE = {"KVMilliSeconds": "ExposureTime", "KVMilliAmperes": "XRayTubeCurrent"}
+XIM_BEAM = (
+    *("KVKiloVolts", "KVCollimatorFoil", "KVCollimatorShape", "KVFocalSpot", "MVEnergy"),
+    *("ImageMode", "DoseConversionFactor"),
+)
 XIM_KEYS = (
     Key("PixelWidth, PixelHeight", "applied", "in cm"),
     Key("compression indicator", "refused", "RTK reads packed pixels", (1,)),
     Key("bytes per pixel", "refused", "pixels of 32 bits", (4,)),
     Key("size of the look-up table", "compared", "with rows and columns"),
-    Key("KVNormChamber", "ignored", "give it as views.exposure where it changes"),
+    Key("KVNormChamber", "compared", "of views and flat fields, as an exposure"),
+    Key(
+        ", ".join(XIM_EXPOSURE),
+        "compared",
+        "as ExposureTime and XRayTubeCurrent, where there is no KVNormChamber",
+    ),
+    Key(", ".join(XIM_BEAM), "compared", "of views and flat fields; warned of"),
+    Key("AcquisitionNotes", "ignored", SAID),
 )
 VARIAN_KEYS = (
     Key("SizeX, SizeY", "applied", "(rows - 1) x columns must be a multiple of 4 in .hnd and .xim"),
     Key("dIDUResolutionX, dIDUResolutionY", "applied", "the pixel size in mm"),
-    Key("dCTNormChamber", "ignored", "give it as views.exposure where it changes"),
+    Key("dCTNormChamber", "compared", "of views and flat fields, as an exposure"),
+    Key("dXRayMA", "compared", "as XRayTubeCurrent, where there is no dCTNormChamber"),
+    Key("dXRayKV", "compared", "of views and flat fields; warned of"),
+    Key("nPixelOffset", "ignored", "but for a warning, unless 0"),
     Key("dCTProjectionAngle, dSAD, dSFD, dIDUPosLat", "ignored", "the camera decides"),
 )
 #: Most bytes of the header of an EDF, which is a multiple of `EDF_BLOCK`.
@@ -106,7 +136,9 @@ def rtk_header(file: Path) -> Header:
     elif form == "HIS":
         _check_his(file)
     elif form == "XIM":
-        _check_xim(file)
+        stated, unknown = _check_xim(file)
+    else:
+        stated, unknown = _of_varian(file)
     reader = _reader(file)
     reader.UpdateOutputInformation()
     columns, rows, pages = size = tuple(reader.GetOutput().GetLargestPossibleRegion().GetSize())
@@ -184,8 +216,8 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
     numbers = (number_of(text, f"{file}: {name}") for name, text in times.items())
     exposed = {f"{1000 * time:.6g}" for time in numbers if time is not None}
     texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
-    texts |= {name: stated.get(name, "") for name in EDF_REGION}
-    unknown = unknown_entries(stated, EDF_KEYS)
+    texts |= {name: stated.get(name, "") for name in (*EDF_REGION, "energy")}
+    unknown = unknown_entries(stated, EDF_KEYS) + said([("title", stated.get("title", ""))])
     return kind, {name: [text] for name, text in texts.items() if text}, unknown
 
 
@@ -204,7 +236,10 @@ def _check_his(file: Path) -> None:
     check_declared(file, (frames, rows, columns), 2, file, len(head) + extra)
 
 
-def _check_xim(file: Path) -> None:
+def _check_xim(file: Path) -> tuple[dict[str, list[str]], list[str]]:
+    """Exposure and beam by the names of properties, and properties that mvrecon does not know and
+    that may change values; raises Refused for `XIM_KEYS` to refuse.
+    """
     with file.open("rb") as raw:
         head = raw.read(36)
     columns, rows, _, size, packed, table = struct.unpack_from("<12x6i", head)
@@ -216,3 +251,45 @@ def _check_xim(file: Path) -> None:
             f"{file}: expected a look-up table of {expected} bytes for {rows} x {columns} pixels, "
             f"got {table}"
         )
+    own = _xim_properties(file)
+    measured = float(own.get("KVNormChamber") or 0) != 0
+    names = {"KVNormChamber": "KVNormChamber"} if measured else XIM_EXPOSURE
+    names = names | {name: name for name in XIM_BEAM}
+    stated = {new: [own[name]] for name, new in names.items() if own.get(name)}
+    others = unknown_names(own, XIM_KEYS)
+    unknown = [name for name in others if has_effect(name, own[name], IMAGE_EFFECTS)]
+    return stated, unknown + said([("AcquisitionNotes", own.get("AcquisitionNotes", ""))])
+
+
+def _of_varian(file: Path) -> tuple[dict[str, list[str]], list[str]]:
+    """Exposure and beam that the header of .hnc and .hnd states, none of 0, and an offset."""
+    with file.open("rb") as raw:
+        head = raw.read(512)
+    voltage, current, *_, chamber = struct.unpack_from("<6d", head, 400)
+    own = {"dXRayKV": voltage}
+    own |= {"dCTNormChamber": chamber} if chamber else {"XRayTubeCurrent": current}
+    stated = {name: [f"{value:.9g}"] for name, value in own.items() if value}
+    return stated, ["nPixelOffset"] * any(head[160:164])
+
+
+def _xim_properties(file: Path) -> dict[str, str]:
+    """The numbers and texts behind the pixels by their names, without lists."""
+    found = {}
+    with file.open("rb") as raw:
+
+        def number() -> int:
+            return struct.unpack("<i", raw.read(4))[0]
+
+        raw.seek(32)
+        raw.seek(number(), os.SEEK_CUR)  # the look-up table
+        raw.seek(number() + 4, os.SEEK_CUR)  # the pixels, and their unpacked size
+        raw.seek(4 * number(), os.SEEK_CUR)  # the histogram
+        for _ in range(number()):
+            name, kind = raw.read(number()).decode("latin-1"), number()
+            if kind == 0:
+                found[name] = str(number())
+            elif kind == 1:
+                found[name] = f"{struct.unpack('<d', raw.read(8))[0]:.9g}"
+            elif (text := raw.read(number())) and kind == 2:
+                found[name] = text.decode("latin-1").strip("\0 ")
+    return found

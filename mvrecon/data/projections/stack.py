@@ -66,6 +66,7 @@ class Header(NamedTuple):
         own: those of the pages of this file.
         unknown: keys that the reader does not know, and that may change what it reads.
         angles: angles in degrees by which the pages' cameras are turned, if stated.
+        units: units that the file states for the pixels.
     """
 
     shape: tuple[int, int]
@@ -81,6 +82,7 @@ class Header(NamedTuple):
     own: Sequence[PlaceInSet] = ()
     unknown: Sequence[str] = ()
     angles: Sequence[float] = ()
+    units: str = ""
 
     @property
     def words(self) -> str:
@@ -139,7 +141,7 @@ class ProjectionStack(ABC):
     stated: Mapping[str, Sequence[str]] = {}
     #: What the files state of the detector, by name, which fields have in common with their views.
     detector: Mapping[str, Any] = {}
-    #: Units that HDF5 of another program states for the pixels; they must suit their kind.
+    #: Units that a file of another program states for the pixels; they must suit their kind.
     units: str = ""
     #: Keys of the files that their reader does not know, and that may change values or geometry.
     unknown: Sequence[str] = ()
@@ -337,7 +339,8 @@ class ItkViews(ProjectionStack):
     """
 
     def __init__(self, path: Path):
-        self._image = itk_image(path, least=2)
+        self._image = itk_image(path, views=True)
+        self.units = self._image.unit
         columns, rows, views = self._image.size
         names = [f"{path.stem} {k}" for k in range(views)]
         super().__init__(path, names, (rows, columns), self._image.dtype)

@@ -45,7 +45,8 @@ from mvrecon.geometry.cameras.camera import Cameras
 MAX_WRONG = 0.1
 #: Units of logarithms and of attenuation.
 LOGARITHMS = re.compile(
-    r"absor(?!bed)|\bm?abs\b|optical.?de(ns|p)|^od$|extinct|attenuat|line.?integral|^projections?$|"
+    r"hounsfield|^hu$|hnsf|absor(?!bed)|\bm?abs\b|optical.?de(ns|p)|^od$|extinct|attenuat|"
+    r"line.?integral|^projections?$|"
     r"(?<![a-z])((neg|minus)[ _-]?)?(ln|lg|log(arithm(ic)?)?)(10|2|e)?(?![a-z])|"
     r"^(1 ?/|/|per) ?[cmnuµ]?m\b|\b[cmnuµ]?m ?(\^|\*\*)?\{?[-⁻][1¹]",
     re.IGNORECASE,

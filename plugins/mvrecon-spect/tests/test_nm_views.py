@@ -490,3 +490,13 @@ def test_slots_are_compared_with_their_nominal_time(tmp_path: Path, frame, slots
         warnings.simplefilter("always")
         list(read_frames(study(tmp_path / "a.dcm", GatedInformationSequence=[gate])))
     assert ["TimeSlotTime" in str(one.message) for one in caught] == [True] * warned
+
+
+def test_texts_that_state_corrections_of_counts_are_named(tmp_path: Path):
+    """In one warning; not that of a codec."""
+    for text, count in (("scatter corrected", 1), ("Lossless JPEG compression", 0)):
+        path = study(tmp_path / "a.dcm", DerivationDescription=text, ImageComments="rest, supine")
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            open_projections(path, dataset="window2")
+        assert [text in str(one.message) for one in caught] == [True] * count

@@ -13,7 +13,7 @@ from mvrecon.data.dicom_pixels import pixels_of
 from mvrecon.data.projections.dicom_views import BEAM, CAMERA_PLACES
 from mvrecon.data.projections.exposures import DICOM
 from mvrecon.data.projections.opening import open_projections
-from tests.data.projections.conftest import CT_PD, VIEWS, dicom_image, grey
+from tests.data.projections.conftest import CT_PD, VIEWS, dicom_image, grey, opened
 from tests.data.projections.test_dicom_pixels import compressed, item, mapping
 
 SHARED, OWN = "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"
@@ -225,7 +225,7 @@ def test_places_that_agree_are_applied_once(case, tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    (*DICOM, *BEAM, *CAMERA_PLACES),
+    [n for n in (*DICOM, *BEAM, *CAMERA_PLACES) if n != "PhotometricInterpretation"],
 )
 def test_views_of_several_exposures_are_warned_of(name, tmp_path):
     """In each of DICOM's units, in files of their own as in the functional groups of frames, where
@@ -238,6 +238,19 @@ def test_views_of_several_exposures_are_warned_of(name, tmp_path):
         dicom_image(tmp_path / f"{k}.dcm", grey()[k], **tags)
     with pytest.warns(UserWarning, match=f"views have several values of {name}, 100.* or 102"):
         open_projections(tmp_path)
+
+
+def test_views_and_fields_that_a_program_may_have_inverted_are_warned_of(tmp_path):
+    """Some invert the pixels of MONOCHROME1, which by itself affects display alone."""
+    shown = {"PhotometricInterpretation": "MONOCHROME1"}
+    for k in range(2):
+        dicom_image(tmp_path / f"{k}.dcm", grey()[k], InstanceNumber=k, **(shown if k else {}))
+    with pytest.warns(UserWarning, match="several values of PhotometricInterpretation"):
+        open_projections(tmp_path)
+    (tmp_path / "1.dcm").unlink()
+    dicom_image(tmp_path / "flat.dcm", grey()[1] * 0 + 60_000, **shown)
+    with pytest.warns(UserWarning, match="flat field has the PhotometricInterpretation MONOC"):
+        opened(tmp_path, find_bad_pixels=False)
 
 
 def test_exposures_of_radiotherapy_images_are_warned_of(tmp_path):

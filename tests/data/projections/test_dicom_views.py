@@ -404,3 +404,39 @@ def test_angles_that_cannot_be_compared_are_not(secondary, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rest.check_rig(CAMERAS.from_config({**options, "detector": detector}))
+
+
+@pytest.mark.parametrize(
+    ("tags", "expected"),
+    [
+        ({"ImageComments": "pixel values multiplied by 2"}, "ImageComments: pixel values mult"),
+        ({"ImageComments": "flat: exposure 3, slope=2"}, "ImageComments: slope"),
+        ({"AcquisitionDeviceProcessingDescription": "LOG SUBTRACTED"}, "LOG SUBTRACTED"),
+        ({"DerivationDescription": "Smoothed"}, "derivation 'Smoothed'"),
+        ({"ImageComments": "left knee, 0.5 mm of aluminium"}, None),
+        ({"DerivationDescription": "Lossless JPEG compression"}, None),
+    ],
+)
+def test_texts_of_dicom_that_state_what_was_done_to_values_are_named(tags, expected, tmp_path):
+    """In one warning. Tried as well: FrameComments, and of frames in their functional groups."""
+    texts = warned(views(tmp_path, **tags))
+    assert (texts == []) if expected is None else (len(texts) == 1 and expected in texts[0])
+
+
+def test_units_of_dicom_are_compared_with_the_kind_of_views(tmp_path):
+    """Attenuation and Hounsfield units are no intensities; a number without a unit may be."""
+    for unit, refused in (("/cm", True), ("[hnsf'U]", True), ("1", False), ("{counts}", False)):
+        code = item(CodeValue=unit, CodingSchemeDesignator="UCUM", CodeMeaning="unit")
+        mapping = item(
+            RealWorldValueFirstValueMapped=0,
+            RealWorldValueLastValueMapped=65535,
+            RealWorldValueSlope=1.0,
+            RealWorldValueIntercept=0.0,
+            MeasurementUnitsCodeSequence=[code],
+        )
+        folder = views(tmp_path, RealWorldValueMappingSequence=[mapping])
+        if refused:
+            with pytest.raises(Refused, match="expected units of intensities"):
+                warned(folder)
+        else:
+            assert warned(folder) == []

@@ -78,14 +78,23 @@ def hnd(path, values):
     path.write_bytes(_varian(values, 1024) + b"".join(_packed(values)) + bytes(4))
 
 
-def xim(path, values, packing=1, table=None):
-    """TrueBeam's format: packed pixels, a histogram, and properties in cm."""
+def xim(path, values, packing=1, table=None, **properties):
+    """TrueBeam's format: packed pixels, a histogram, and properties, lengths in cm."""
     first, pixels = _packed(values)
     table = len(first) if table is None else table
     head = struct.pack("<8s7i", b"VMS.XI", 1, *values.shape[::-1], 32, 4, packing, table)
-    tail = struct.pack("<3i", values.size * 4, 0, 2)
-    for name, mm in zip((b"PixelHeight", b"PixelWidth"), PIXEL_MM, strict=True):
-        tail += struct.pack(f"<i{len(name)}sid", len(name), name, 1, mm / 10)
+    properties |= {"PixelHeight": PIXEL_MM[0] / 10, "PixelWidth": PIXEL_MM[1] / 10}
+    tail = struct.pack("<5i", values.size * 4, 2, 7, 7, len(properties))
+    for name, value in properties.items():
+        tail += struct.pack(f"<i{len(name)}s", len(name), name.encode())
+        if isinstance(value, int):
+            tail += struct.pack("<2i", 0, value)
+        elif isinstance(value, float):
+            tail += struct.pack("<id", 1, value)
+        elif isinstance(value, str):
+            tail += struct.pack(f"<2i{len(value)}s", 2, len(value), value.encode())
+        else:
+            tail += struct.pack(f"<2i{len(value)}d", 4, 8 * len(value), *value)
     path.write_bytes(head + first + struct.pack("<i", len(pixels)) + pixels + tail)
 
 
@@ -259,6 +268,74 @@ def test_the_part_of_the_detector_that_edf_states_is_compared(tmp_path):
         _, stated, unknown = rtk_images._check_edf(tmp_path / f"{k}.edf")
         assert stated == {name: [str(value)] for name, value in keys.items()}
         assert unknown == []
+
+
+TRUEBEAM = {
+    **{"GantryRtn": 12.5, "KVDetectorVrt": -50.0, "KVSourceVrt": 100.0, "CouchLat": 0.1},
+    **{"KVKiloVolts": 125.0, "KVMilliAmperes": 60.0, "KVMilliSeconds": 20.0},
+    **{"KVNormChamber": 20_000, "KVCollimatorShape": "None", "DataGain": 1.0, "DataOffset": 0.0},
+    **{"AcquisitionNotes": "", "MLCLeafsA": [1.0, 2.0], "StartTime": 1234, "MVDoseRate": 0.0},
+}
+
+
+def test_properties_of_xim_are_compared_or_named(tmp_path):
+    """The exposure by the chamber's reading, else by current and time. Of the others, those with a
+    word such as gain, unless it changes nothing.
+    """
+    path, values = tmp_path / "a.xim", grey(60_000)[0]
+    beam = {"KVKiloVolts": ["125"], "KVCollimatorShape": ["None"]}
+    xim(path, values, **TRUEBEAM)
+    assert rtk_images._check_xim(path) == ({"KVNormChamber": ["20000"], **beam}, [])
+    xim(path, values, **{**TRUEBEAM, "KVNormChamber": 0})
+    exposures = {"ExposureTime": ["20"], "XRayTubeCurrent": ["60"]}
+    assert rtk_images._check_xim(path) == ({**exposures, **beam}, [])
+    changed = {"DataGain": 2.0, "DataOffset": 100.0, "AcquisitionNotes": "scaled by 2"}
+    xim(path, values, **{**TRUEBEAM, **changed})
+    unknown = ["DataGain", "DataOffset", "AcquisitionNotes: scaled by"]
+    assert rtk_images._check_xim(path)[1] == unknown
+
+
+@needs_rtk
+def test_a_flat_field_of_another_exposure_of_xim_is_warned_of_and_applied_by_its_name(tmp_path):
+    """A view of thrice the light of the flat field's, by the chamber, has the same integrals."""
+    values = grey(20_000)[0]
+    xim(tmp_path / "flat.xim", np.full_like(values, 20_000), **TRUEBEAM)
+    brighter = {**TRUEBEAM, "KVNormChamber": 60_000, "KVMilliAmperes": 180.0}
+    xim(tmp_path / "view.xim", 3 * values, **brighter)
+    options = {"flat": tmp_path / "flat.xim", "layout": "projections", "find_bad_pixels": False}
+    with pytest.warns(UserWarning, match="KVNormChamber .*views.exposure=KVNormChamber"):
+        opened(tmp_path / "view.xim", **options)
+    found = opened(tmp_path / "view.xim", exposure="KVNormChamber", **options).whole().views[0]
+    np.testing.assert_allclose(found.numpy(), -np.log(values / 20_000), atol=1e-5)
+
+
+@pytest.mark.parametrize("write", [hnc, hnd])
+def test_what_the_header_of_varians_obi_states_of_the_light_is_compared(write, tmp_path):
+    """The chamber's reading, else the current; the 30th, 31st and 35th of its numbers."""
+    path = tmp_path / f"a.{write.__name__}"
+    write(path, grey(60_000)[0])
+    head = bytearray(path.read_bytes())
+    path.write_bytes(head)
+    assert rtk_images._of_varian(path) == ({}, [])
+    struct.pack_into("<2d", head, 168 + 29 * 8, 110.0, 20.0)
+    path.write_bytes(head)
+    stated = {"dXRayKV": ["110"], "XRayTubeCurrent": ["20"]}
+    assert rtk_images._of_varian(path) == (stated, [])
+    struct.pack_into("<d", head, 168 + 34 * 8, 1234.5)
+    struct.pack_into("<I", head, 160, 7)
+    path.write_bytes(head)
+    stated = {"dXRayKV": ["110"], "dCTNormChamber": ["1234.5"]}
+    assert rtk_images._of_varian(path) == (stated, ["nPixelOffset"])
+
+
+def test_how_cameras_turned_images_and_the_title_of_edf_are_searched(tmp_path):
+    path, values = tmp_path / "a.edf", grey(20_000)[0].astype("u2")
+    edf(path, values, image_flip="<flip x : True>", energy=20, title="knee 3")
+    _, stated, unknown = rtk_images._check_edf(path)
+    assert stated == {"image_flip": ["<flip x : True>"], "energy": ["20"]}
+    assert unknown == []
+    edf(path, values, title="-log(I/I0)")
+    assert rtk_images._check_edf(path)[2] == ["title: -log(I/I0)"]
 
 
 @pytest.mark.parametrize("text", ["-", "auto", "1e", "0.1.2", "nan"])

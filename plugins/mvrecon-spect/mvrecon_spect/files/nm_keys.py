@@ -7,7 +7,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import Refused, file_errors, shown
 from mvrecon.core.files.keys import Key, warn_of_unknown
-from mvrecon.data.dicom_image import ONE_FILE, DicomImage, same
+from mvrecon.data.dicom_image import DERIVED, ONE_FILE, DicomImage, same
 
 WINDOW = "EnergyWindowVector"
 VIEW = ("DetectorVector", "RotationVector", "AngularViewVector")
@@ -76,6 +76,7 @@ KEYS = (
     Key(", ".join(DESCRIBED.values()), "applied", "numbered by its vector"),
     Key("SliceVector", "refused", "where slices differ: a volume"),
     *ONE_FILE,
+    *DERIVED,
     Key(
         "StartAngle",
         "applied",
@@ -141,7 +142,7 @@ def check_counts(image: DicomImage) -> None:
 
 def check_alike(image: DicomImage) -> None:
     """Raise for detectors with several zooms; warn of what changes between rotations or time slots,
-    and of private attributes that may change the counts.
+    and of texts and private attributes that may change the counts.
     """
     zooms = image.anywhere("ZoomFactor")
     if not all(same(zoom, zooms[0]) for zoom in zooms):
@@ -166,7 +167,7 @@ def check_alike(image: DicomImage) -> None:
             f"are not corrected",
             stacklevel=3,
         )
-    warn_of_unknown(image.path, image.private())
+    warn_of_unknown(image.path, [*image.private(), *image.derived()])
 
 
 def _slot_times(interval: Any) -> list[float]:
