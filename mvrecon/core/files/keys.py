@@ -59,6 +59,7 @@ IMAGE_EFFECTS = {
     "gamma(?!.?ray)": 1,
     "(?<!\\ba)gain": (1, 0),  # 0 dB
 }
+EFFECT = re.compile("|".join(IMAGE_EFFECTS))
 #: Values of any key with such a word that change nothing.
 OFF = ("no", "none", "off", "false", "unknown")
 #: Unknown keys that a warning names, and characters of a name that are searched for words.
@@ -78,6 +79,12 @@ def has_effect(name: str, value: Any, effects: Mapping[str, Any] = EFFECTS) -> b
         return False
     values = neutral[-1] if isinstance(neutral[-1], tuple) else (neutral[-1],)
     return _plain(value) not in (*map(_plain, values), *OFF)
+
+
+def effect_at(text: str) -> int:
+    """Where the first word of `IMAGE_EFFECTS` is in a text; -1 without one."""
+    found = EFFECT.search(text.lower())  # faster than regardless of case
+    return found.start() if found else -1
 
 
 def _neutral(name: str, effects: Mapping[str, Any]) -> list[Any]:
@@ -133,11 +140,12 @@ def unknown_entries(stated: Mapping[str, str], keys: Sequence[Key]) -> list[str]
     """
     known = [key._replace(name=key.name.lower()) for key in keys]
     nothing = (0, *OFF, *NOTHING)
-    names = {name.lower(): name for name in stated}
+    unknown = {*unknown_names((name.lower() for name in stated), known)}
     return [
         name
-        for name in (names[lower] for lower in unknown_names(names, known))
-        if _plain(stated[name]) not in nothing
+        for name in stated
+        if name.lower() in unknown
+        and _plain(stated[name]) not in nothing
         and (not _neutral(name, IMAGE_EFFECTS) or has_effect(name, stated[name], IMAGE_EFFECTS))
     ]
 

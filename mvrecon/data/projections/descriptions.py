@@ -16,7 +16,14 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, millimetres, shown
-from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, has_effect, unknown_entries
+from mvrecon.core.files.keys import (
+    IMAGE_EFFECTS,
+    Key,
+    effect_at,
+    has_effect,
+    unknown_entries,
+    unknown_names,
+)
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -58,7 +65,7 @@ KEYS = (
         "applied",
         "the greatest grey value",
     ),
-    Key("OME: Type", "compared", "with the type of the pixels"),
+    Key("OME: Type, OME: SizeX, OME: SizeY", "compared", "with the type and the number of pixels"),
     Key(
         "Dectris: N_excluded_pixels",
         "compared",
@@ -95,28 +102,26 @@ KEYS = (
     Key(
         "ImageJ: unit, ImageJ: ?unit, ImageJ: spacing, ImageJ: ?origin, ImageJ: min, ImageJ: max, "
         "ImageJ: mode, ImageJ: loop, ImageJ: hyperstack, ImageJ: finterval, ImageJ: fps, "
-        "SCIFIO: units, SCIFIO: scales, SCIFIO: bitsPerPixel",
+        "SCIFIO: unit*, SCIFIO: scales, SCIFIO: bitsPerPixel, SCIFIO: mode, SCIFIO: hyperstack",
         "ignored",
         "of the pixel size, the display, and the name of values that cf calibrates",
     ),
-    Key(
-        ", ".join(
-            f"*: {name}"
-            for name in (
-                *("date*", "time", "timestamp", "creation time", "title", "author", "artist"),
-                *("operator", "user", "copyright", "software*", "version", "make", "model"),
-                *("host*", "source", "filename", "file name"),
-            )
-        ),
-        "ignored",
-        "texts of any program",
-    ),
+)
+#: Texts that any program writes, unless they state more, such as "Title: scaled by 2".
+TEXTS = Key(
+    "*: date, *: date.create, *: date.modify, *: date.timestamp, *: date?time, *: datetime, "
+    "*: time, *: timestamp, *: creation?time, *: title, *: author, *: artist, *: operator, "
+    "*: user, *: copyright, *: software, *: software?version, *: softwareversion, *: version, "
+    "*: make, *: model, *: host, *: hostname, *: host?computer, *: hostcomputer, *: source, "
+    "*: file?name, *: filename",
+    "ignored",
+    "texts of any program, unless they contain other entries or words such as scaled",
 )
 #: Programs that describe images in lines of a name and a value, and marks of their texts.
 MARKS = {
     "ImageJ": r"^ImageJ=",
     "SCIFIO": r"^SCIFIO=",
-    "Dectris": r"^# ",
+    "Dectris": r"^# *(Exposure_time|Count_cutoff|N_excluded_pixels)\b",
     "tifffile": r"^\{\"shape\": ",
 }
 #: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
@@ -131,16 +136,22 @@ QUOTED = re.compile(
 OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 #: An element of OME's description that says which page of a file is which image.
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
-LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
+LINE = re.compile(r"^[ \t]*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
-#: A value in an element of XML, an object within one of JSON, and where a text divides: lines,
-#: parts of lists, elements.
-ELEMENT = re.compile(r"<([\w:.-]+)[^<>]*>\s*([^<>\s][^<>]*)</")
+#: An element of XML with a value, and what is no content: names, declarations and marks of others.
+ELEMENT = re.compile(r"<([\w:.-]+[^<>]*)(?<!/)>\s*([^<>\s][^<>]*)</[^<>]*>")
+MARKUP = re.compile(r"</[^<>]*>|<[\w:.-]+>|<\?[^<>]*>|<!(?:\w[^<>]*>|--|\[CDATA\[)|-->|\]\]>")
+#: OME's description, and the texts of its authors in it.
+OF_OME = re.compile(r"<(\w+:)?OME\b.*", re.DOTALL)
+AUTHORS = re.compile(r"<(?:\w+:)?Description>([^<]*)<")
+#: An object within one of JSON, lists of numbers and numbers below their name, and where a text
+#: divides: lines, parts of lists, elements.
 OBJECT = re.compile(r"\"\s*:\s*\{\s*\"")
+BELOW = re.compile(r"([:=,[])\s*[\n\r]\s*(?=[-+.\d[])")
 PART = re.compile(r"[\n\r;<>{}]|,(?=\s*[\"'[])|,(?=\s*[^\W\d][\w .-]{0,60}[:=])")
-#: An entry, a name and a value; and the name of another within its value.
+#: An entry, a name and a value; and the name of another within its value, but no path or address.
 ENTRY = re.compile(r"([^\W\d][^:=\t\"']*?)[\"']?\s*[:=\t]\s*(.*)")
-INNER = re.compile(r"[^\W\d][\"']?\s*[:=]")
+INNER = re.compile(r"(?:[^\W\d][\"']?\s*:|\w[\"']?\s*=)(?![\\/])")
 #: Characters of a part of a text that are named.
 PART_SHOWN = 80
 #: A comma between thousands.
@@ -156,28 +167,47 @@ def without_own_id(text: str) -> str:
 
 @lru_cache(maxsize=32)
 def unknown_parts(text: str) -> list[str]:
-    """What a text states beside the entries of `KEYS`: the names of its other entries (lines of a
-    name and a value, JSON, XML), and other lines with words; but no entry whose value is zero,
-    empty or a word such as "off". OME's and MetaMorph's texts have no such parts.
+    """What a text states beside the entries of `KEYS` and `TEXTS`: the names of its other entries
+    (lines of a name and a value, JSON, XML), and other lines with letters; but no entry whose value
+    is zero, empty or a word such as "off". An entry whose value contains others, or a word such as
+    "scaled", is named with it. Of OME's text these are the parts of its authors' descriptions; that
+    of MetaMorph has none.
     """
-    if OME.search(text) or text.startswith("<MetaData"):
+    if text.startswith("<MetaData"):
         return []
+    text = OF_OME.sub(lambda found: "\n".join(AUTHORS.findall(found[0])), text)
     program = next((name for name, mark in MARKS.items() if re.search(mark, text, re.M)), "text")
-    stated, names = {}, {}
-    lines = ELEMENT.sub(r"\n\1: \2\n<", LINE.sub(r"\1: \2", text))
-    for part in PART.split(OBJECT.sub(".", lines)):
-        plain = part.strip(" \t,[]()#*\"'")
+    if program == "Dectris":
+        text = LINE.sub(r"\1: \2", text)
+    text = MARKUP.sub("\n", ELEMENT.sub(r"\n\1 = \2\n", BELOW.sub(r"\1 ", text)))
+    text = re.sub(" +", " ", text)
+    stated, parts = {}, {}
+    for part in PART.split(OBJECT.sub(".", text)):
+        plain = part.strip(" \t,[]()#*\"'!?/")
         entry = ENTRY.fullmatch(plain)
         name, value = entry.groups() if entry else (plain, plain)
-        if not (entry or re.search(r"[^\W\d]{2}", name)) or part.startswith(("/", "?", "!")):
+        if not (entry or re.search(r"[^\W\d_]|[^\0-\x7f]", name)):
             continue
         value = re.sub(r"[\s,\"'()[\]]+", " ", value)
-        brief = plain if INNER.search(value) else name
         key = f"{program}: {name}"
         key = key if stated.get(key, value) == value else f"{program}: {plain}"
-        stated[key] = value
-        names[key] = brief if len(brief) <= PART_SHOWN else f"{brief[:PART_SHOWN]}..."
-    return [names[key] for key in unknown_entries(stated, KEYS)]
+        stated[key], parts[key] = value, (name, plain)
+    found = unknown_entries(stated, KEYS)
+    others = {*unknown_names(map(str.lower, found), [TEXTS])}
+    names = []
+    for key in found:
+        name, plain = parts[key]
+        telling = INNER.search(stated[key]) or effect_at(stated[key]) >= 0
+        if telling or effect_at(name) >= 0 or key.lower() in others:
+            names.append(_brief(plain if telling else name))
+    return names
+
+
+def _brief(part: str) -> str:
+    """A part of a text, cut to its characters around its first word of an effect."""
+    first = max(0, min(effect_at(part) - PART_SHOWN // 2, len(part) - PART_SHOWN))
+    cut = part[first : first + PART_SHOWN]
+    return f"{'...' * (first > 0)}{cut}{'...' * (first + PART_SHOWN < len(part))}"
 
 
 @lru_cache(maxsize=4)
@@ -292,9 +322,8 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
                 value = value.get("PropVal") if isinstance(value, dict) else value
                 _add(stated, f"Micro-Manager {name}", 0, str(value))
     head = head._replace(stated=stated)
-    entries = dict(LINE.findall(text)) if "#" in text else {}
-    if {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
-        return _of_dectris(file, head, entries)
+    if re.search(MARKS["Dectris"], text, re.M):
+        return _of_dectris(file, head, dict(LINE.findall(text)))
     return head
 
 
@@ -351,6 +380,13 @@ def of_file(file: Path, head: Header, text: str, own: Sequence[PlaceInSet]) -> H
     """
     stated = {name: list(texts) for name, texts in head.stated.items()}
     for _, pixels in elements(text, "Pixels"):
+        size = tuple(int(pixels.get(f"Size{a}", n)) for a, n in zip("YX", head.shape, strict=True))
+        if size != head.shape:
+            raise Refused(
+                f"{file}: expected {size[0]} x {size[1]} pixels by OME's SizeY and SizeX, got "
+                f"{head.shape[0]} x {head.shape[1]}; were the images cut or turned? Save them "
+                f"without that description"
+            )
         kind = pixels.get("Type", "")
         if np.dtype(TYPES.get(kind, head.dtype)) != head.dtype.newbyteorder("="):
             raise Refused(f"{file}: expected pixels of OME's Type {kind}, got {head.dtype}")

@@ -1,5 +1,6 @@
 """TIFF images of tifffile, Pillow and SimpleITK: every type and tag is applied or refused."""
 
+import struct
 import warnings
 
 import numpy as np
@@ -275,6 +276,59 @@ def test_a_stack_of_two_axes_or_of_several_files_is_refused(options, message, tm
     values, metadata = (values[0], None) if first else (values, {"axes": axes})
     tifffile.imwrite(path, values, **{"metadata": metadata, **options})
     path.write_bytes(path.read_bytes().replace(b'SizeZ="12"', more or b'SizeZ="12"'))
+    with pytest.raises(Refused, match=message):
+        open_projections(path)
+
+
+SCIFIO = "SCIFIO=0.37.3\naxes=X,Y,Channel,Time\nimages=12\nchannels={}\nslices=1\nframes={}\n"
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"SizeZ": 12}, None),
+        ({"SizeZ": 6, "SizeC": 2}, "SizeC 2 and SizeZ 6"),
+        ({}, "states, 1, got 12"),
+        ({"SizeZ": 12, "SizeX": 6, "SizeY": 8}, "8 x 6 pixels by OME's SizeY and SizeX, got 6 x 8"),
+        ("SCIFIO", "channels 2 and frames 6"),
+    ],
+)
+@pytest.mark.parametrize("equals", ['{}="{}"', "{}='{}'", '{} = "{}"'])
+def test_axes_are_read_however_they_are_quoted(equals, sizes, message, tmp_path):
+    """Also with other numbers in what OME quotes of another program."""
+    if sizes == "SCIFIO":
+        text = SCIFIO.format(2, 6)
+    else:
+        pixels = " ".join(equals.format(*item) for item in sizes.items())
+        other = '<OriginalMetadata><x SizeC="2" SizeT="3"/></OriginalMetadata>'
+        text = f"<OME><Image><Pixels {pixels}><TiffData/></Pixels></Image>{other}</OME>"
+    path = written(tmp_path / "a.tif", grey(), description=text)
+    if message is None:
+        assert np.array_equal(open_projections(path).read(0, 12), grey())
+    else:
+        with pytest.raises(Refused, match=message):
+            open_projections(path)
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "message"),
+    [
+        ("BitsPerSample", 12, "73 bytes of pixels of 12 packed bits .* got 96"),
+        ("BitsPerSample", 24, "8, 16 or 32 bits, got 24"),
+        ("Predictor", 2, "no Predictor without LZW"),
+    ],
+)
+def test_pixels_that_programs_read_differently_are_refused(tag, value, message, tmp_path):
+    """Words of 16 bits whose tag states their 12 significant bits, as some cameras write them,
+    which are no packed bits; 24 bits, which tifffile reads as big-endian always; and differences of
+    pixels without compression, which libtiff never applies.
+    """
+    values = grey()[0] if value != 24 else grey()[0, :, :4].astype("u4")
+    path = written(tmp_path / "a.tif", values, extratags=[(40123, "H", 1, 1, True)])
+    predictor = path.read_bytes().replace(struct.pack("<HH", 40123, 3), struct.pack("<HH", 317, 3))
+    path.write_bytes(predictor)
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        file.pages[0].tags[tag].overwrite(value)
     with pytest.raises(Refused, match=message):
         open_projections(path)
 
