@@ -148,7 +148,7 @@ AUTHORS = re.compile(r"<(?:\w+:)?Description>([^<]*)<")
 #: divides: lines, parts of lists, elements.
 OBJECT = re.compile(r"\"\s*:\s*\{\s*\"")
 BELOW = re.compile(r"([:=,[])\s*[\n\r]\s*(?=[-+.\d[])")
-PART = re.compile(r"[\n\r;<>{}]|,(?=\s*[\"'[])|,(?=\s*[^\W\d][\w .-]{0,60}[:=])")
+PART = re.compile(r"[\0-\x08\n-\x1f;<>{}]|,(?=\s*[\"'[])|,(?=\s*[^\W\d][\w .-]{0,60}[:=])")
 #: An entry, a name and a value; and the name of another within its value, but no path or address.
 ENTRY = re.compile(r"([^\W\d][^:=\t\"']*?)[\"']?\s*[:=\t]\s*(.*)")
 INNER = re.compile(r"(?:[^\W\d][\"']?\s*:|\w[\"']?\s*=)(?![\\/])")
@@ -204,7 +204,8 @@ def unknown_parts(text: str) -> list[str]:
 
 
 def _brief(part: str) -> str:
-    """A part of a text, cut to its characters around its first word of an effect."""
+    """A part of a text in one line, cut to the characters around its first word of an effect."""
+    part = "".join(filter(str.isprintable, " ".join(part.split())))
     first = max(0, min(effect_at(part) - PART_SHOWN // 2, len(part) - PART_SHOWN))
     cut = part[first : first + PART_SHOWN]
     return f"{'...' * (first > 0)}{cut}{'...' * (first + PART_SHOWN < len(part))}"

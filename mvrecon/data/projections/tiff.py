@@ -353,13 +353,14 @@ def _check_order(
             f"{running[0] if running else stated}, got {images}; are the others in further files?"
         )
     planes = sorted(
-        (int(place.get("IFD", 0)), sum(int(place.get(f"First{axis}", 0)) for axis in "ZCT"))
-        for _, place in descriptions.elements(text, "TiffData")
+        (int(place.get("IFD", 0)), n, sum(int(place.get(f"First{axis}", 0)) for axis in "ZCT"))
+        for n, place in descriptions.elements(text, "TiffData")
     )
-    if planes != sorted(planes, key=lambda plane: plane[1]):
+    if planes != sorted(planes, key=lambda plane: plane[1:]):
+        order = [n - 1 if len(ome) > 1 else k for _, n, k in planes]
         raise Refused(
             f"{file}: expected pages in the order of TiffData in its ImageDescription, got the "
-            f"images {shown([image for _, image in planes])}; sort the pages, and save them again"
+            f"images {shown(order)}; sort the pages, and save them again"
         )
 
 

@@ -358,6 +358,18 @@ def test_pages_of_ome_are_in_the_order_of_its_description(reverse, tmp_path):
         assert np.array_equal(open_projections(tmp_path / "a.tif").read(0, 12), grey())
 
 
+@pytest.mark.parametrize("pages", [(0, 1, 2), (2, 1, 0)])
+def test_pages_of_several_images_of_ome_are_in_their_order(pages, tmp_path):
+    image = '<Image><Pixels SizeX="8" SizeY="6"><TiffData IFD="{}"/></Pixels></Image>'
+    text = f"<OME>{''.join(map(image.format, pages))}</OME>"
+    path = written(tmp_path / "a.tif", grey()[:3], description=text)
+    if pages == (0, 1, 2):
+        assert np.array_equal(open_projections(path).read(0, 3), grey()[:3])
+    else:
+        with pytest.raises(Refused, match="order of TiffData"):
+            open_projections(path)
+
+
 def test_pages_that_are_not_in_the_order_of_their_numbers_are_refused(tmp_path):
     with tifffile.TiffWriter(tmp_path / "a.tif") as file:
         for number, page in zip((2, 0, 1), grey(), strict=False):

@@ -156,6 +156,7 @@ TEXTS = {
     "!inverted\n// bias=5\nx 0.001": ["inverted", "bias", "x 0.001"],
     # What is cut off has no word of an effect.
     "x" * 300 + " multiplied by 5": ["..." + "x" * 64 + " multiplied by 5"],
+    "bias=2\0scale=3\0": ["bias", "scale"],
     # Texts around OME's description, and of its authors.
     "bias=5\n<OME><Image><Description>gain=2</Description><Pixels/></Image></OME>": [
         *("bias", "gain"),
