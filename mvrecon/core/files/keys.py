@@ -138,11 +138,12 @@ def unknown_entries(stated: Mapping[str, str], keys: Sequence[Key]) -> list[str]
     """
     known = [key._replace(name=key.name.lower()) for key in keys]
     nothing = (0, *OFF, *NOTHING)
-    names = {name.lower(): name for name in stated}
+    unknown = {*unknown_names((name.lower() for name in stated), known)}
     return [
         name
-        for name in (names[lower] for lower in unknown_names(names, known))
-        if _plain(stated[name]) not in nothing
+        for name in stated
+        if name.lower() in unknown
+        and _plain(stated[name]) not in nothing
         and (not _neutral(name, IMAGE_EFFECTS) or has_effect(name, stated[name], IMAGE_EFFECTS))
     ]
 

@@ -5,51 +5,70 @@ from collections.abc import Iterable
 
 from mvrecon.core.files.keys import IMAGE_EFFECTS, has_effect
 
-#: An entry in a comment, as Dectris writes it, a value in an element of XML, and an object within
-#: one of JSON.
-LINE = re.compile(r"^\s*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
-ELEMENT = re.compile(r"<([\w:.-]+)[^<>]*>\s*([^<>\s][^<>]*)</")
+#: An element of XML with a value, and what is no content: names, declarations and marks of others.
+ELEMENT = re.compile(r"<([\w:.-]+[^<>]*)(?<!/)>\s*([^<>\s][^<>]*)</[^<>]*>")
+MARKUP = re.compile(r"</[^<>]*>|<[\w:.-]+>|<\?[^<>]*>|<!(?:\w[^<>]*>|--|\[CDATA\[)|-->|\]\]>")
+#: An object within one of JSON, lists of numbers and numbers below their name, and where a text
+#: divides: lines, parts of lists, elements.
 OBJECT = re.compile(r"\"\s*:\s*\{\s*\"")
-#: Where a text divides: lines, parts of lists, elements.
-PART = re.compile(r"[\n\r;<>{}]|,(?=\s*[\"'[])|,(?=\s*[^\W\d][\w .-]{0,60}[:=])")
-#: An entry, a name and a value; and the name of another within its value, but in brackets.
+BELOW = re.compile(r"([:=,[])\s*[\n\r]\s*(?=[-+.\d[])")
+PART = re.compile(r"[\0-\x08\n-\x1f;<>{}]|,(?=\s*[\"'[])|,(?=\s*[^\W\d][\w .-]{0,60}[:=])")
+#: An entry, a name and a value; and the name of another within its value, but no path or address.
 ENTRY = re.compile(r"([^\W\d][^:=\t\"']*?)[\"']?\s*[:=\t]\s*(.*)")
-INNER, BRACKETS = re.compile(r"[^\W\d][\"']?\s*[:=]"), re.compile(r"\([^()]*\)")
+INNER = re.compile(r"(?:[^\W\d][\"']?\s*:|\w[\"']?\s*=)(?![\\/])")
 #: Characters of a part of a text that are shown.
 SHOWN = 80
 #: Words of prose, beside those of keys, on what was done to grey values.
-PROSE = {
-    **IMAGE_EFFECTS,
-    r"divided|rotated|optical.?densit|(?<![a-z])(ln|log(10|2|e)?) ?\(": None,
-}
+WORDS = {**IMAGE_EFFECTS, r"divided|rotated|optical.?densit|(?<![a-z])(ln|log(10|2|e)?) ?\(": None}
+WORD = re.compile("|".join(WORDS))
 
 
-def statements(text: str) -> dict[str, str]:
-    """What a text states, in parts: the values of entries (lines of a name and a value, JSON, XML)
-    by their names; and other lines with words, and lines of several entries, by themselves.
+def statements(text: str) -> dict[str, tuple[str, str]]:
+    """What a text states, in parts, each with its value: entries (lines of a name and a value,
+    JSON, XML) by their names, with their values where these differ; and other lines with letters
+    by themselves.
     """
-    found: dict[str, str] = {}
-    lines = ELEMENT.sub(r"\n\1: \2\n<", LINE.sub(r"\1: \2", text))
-    for part in PART.split(OBJECT.sub(".", lines)):
-        plain = part.strip(" \t,[]()#*\"'")
+    found: dict[str, tuple[str, str]] = {}
+    text = MARKUP.sub("\n", ELEMENT.sub(r"\n\1 = \2\n", BELOW.sub(r"\1 ", text)))
+    for part in PART.split(OBJECT.sub(".", re.sub(" +", " ", text))):
+        plain = part.strip(" \t,[]#*\"'!?/")
         entry = ENTRY.fullmatch(plain)
         name, value = entry.groups() if entry else (plain, plain)
-        if not (entry or re.search(r"[^\W\d]{2}", name)) or part.startswith(("/", "?", "!")):
-            continue
-        several = INNER.search(BRACKETS.sub("", value))
-        value = re.sub(r"[\s,\"'()[\]]+", " ", value)
-        name = plain if several or found.get(name, value) != value else name
-        found[name if len(name) <= SHOWN else f"{name[:SHOWN]}..."] = value
+        if entry or re.search(r"[^\W\d_]|[^\0-\x7f]", name):
+            value = re.sub(r"[\s,\"'()[\]]+", " ", value)
+            once = found.get(name, (value,))[0] == value
+            found[name if once else f"{name} = {value}"] = value, plain
     return found
 
 
 def said(texts: Iterable[tuple[str, str]]) -> list[str]:
-    """The parts of texts that may state what was done to values, behind the names of the texts: an
-    entry whose name has a word of `PROSE` and whose value has an effect, and a line with one.
+    """The parts of texts that may state what was done to values, behind the names of the texts:
+    those with a word of `WORDS`, unless the value of an entry changes nothing.
     """
     return [
-        f"{name}: {part}"
-        for name, text in texts
-        for part, value in statements(text).items()
-        if has_effect(part, value, PROSE)
+        f"{title}: {brief(name, *found)}"
+        for title, text in texts
+        for name, found in statements(text).items()
+        if has_effect(name, found[0], WORDS) or tells(found[0])
     ]
+
+
+def tells(value: str) -> bool:
+    """Whether the value of an entry contains a word of `WORDS`."""
+    return _word_at(value) >= 0
+
+
+def brief(name: str, value: str, part: str) -> str:
+    """The name of an entry, or the whole part if its value contains further entries or a word of
+    `WORDS`, in one line, cut to the characters around its first such word.
+    """
+    shown = part if INNER.search(value) or tells(value) else name
+    shown = "".join(filter(str.isprintable, " ".join(shown.split())))
+    first = max(0, min(_word_at(shown) - SHOWN // 2, len(shown) - SHOWN))
+    cut = shown[first : first + SHOWN]
+    return f"{'...' * (first > 0)}{cut}{'...' * (first + SHOWN < len(shown))}"
+
+
+def _word_at(text: str) -> int:
+    found = WORD.search(text.lower())  # faster than regardless of case
+    return found.start() if found else -1

@@ -16,8 +16,14 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, millimetres, shown
-from mvrecon.core.files.keys import IMAGE_EFFECTS, Key, has_effect, unknown_entries
-from mvrecon.core.files.prose import LINE, statements
+from mvrecon.core.files.keys import (
+    IMAGE_EFFECTS,
+    Key,
+    has_effect,
+    unknown_entries,
+    unknown_names,
+)
+from mvrecon.core.files.prose import brief, statements
 from mvrecon.data.projections.exposures import in_base_units, number_of, unneeded
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
@@ -59,7 +65,7 @@ KEYS = (
         "applied",
         "the greatest grey value",
     ),
-    Key("OME: Type", "compared", "with the type of the pixels"),
+    Key("OME: Type, OME: SizeX, OME: SizeY", "compared", "with the type and the number of pixels"),
     Key(
         "Dectris: N_excluded_pixels",
         "compared",
@@ -96,31 +102,29 @@ KEYS = (
     Key(
         "ImageJ: unit, ImageJ: ?unit, ImageJ: spacing, ImageJ: ?origin, ImageJ: min, ImageJ: max, "
         "ImageJ: mode, ImageJ: loop, ImageJ: hyperstack, ImageJ: finterval, ImageJ: fps, "
-        "SCIFIO: units, SCIFIO: scales, SCIFIO: bitsPerPixel",
+        "SCIFIO: unit*, SCIFIO: scales, SCIFIO: bitsPerPixel, SCIFIO: mode, SCIFIO: hyperstack",
         "ignored",
         "of the pixel size, the display, and the name of values that cf calibrates",
     ),
-    Key(
-        ", ".join(
-            f"*: {name}"
-            for name in (
-                *("date*", "time", "timestamp", "creation time", "title", "author", "artist"),
-                *("operator", "user", "copyright", "software*", "version", "make", "model"),
-                *("host*", "source", "filename", "file name"),
-            )
-        ),
-        "ignored",
-        "texts of any program",
-    ),
+)
+#: Texts that any program writes, unless they state more, such as "Title: scaled by 2".
+TEXTS = Key(
+    "*: date, *: date.create, *: date.modify, *: date.timestamp, *: date?time, *: datetime, "
+    "*: time, *: timestamp, *: creation?time, *: title, *: author, *: artist, *: operator, "
+    "*: user, *: copyright, *: software, *: software?version, *: softwareversion, *: version, "
+    "*: make, *: model, *: host, *: hostname, *: host?computer, *: hostcomputer, *: source, "
+    "*: file?name, *: filename",
+    "ignored",
+    "texts of any program, unless they contain other entries or words such as scaled",
 )
 #: Programs that describe images in lines of a name and a value, and marks of their texts.
 MARKS = {
     "ImageJ": r"^ImageJ=",
     "SCIFIO": r"^SCIFIO=",
-    "Dectris": r"^# ",
+    "Dectris": r"^# *(Exposure_time|Count_cutoff|N_excluded_pixels)\b",
     "tifffile": r"^\{\"shape\": ",
 }
-#: The root of OME's description, an attribute of its elements, and a number of Dectris.
+#: The root of OME's description, an attribute of its elements, and a line and a number of Dectris.
 OME, ATTRIBUTE = re.compile(r"<(\w+:)?OME\b"), re.compile(r"([\w-]+)\s*=\s*[\"']([^\"']*)[\"']")
 #: Parts of OME's description that may quote its elements: comments, and what other programs wrote.
 QUOTED = re.compile(
@@ -132,7 +136,11 @@ QUOTED = re.compile(
 OWN_ID = re.compile(r"(?<=[\s\"'])UUID\s*=\s*(\"[^\"]*\"|'[^']*')")
 #: An element of OME's description that says which page of a file is which image.
 PLACED = re.compile(r"<(?:\w+:)?TiffData\b([^>]*?)(?:/>|>(.*?)</(?:\w+:)?TiffData\s*>)", re.DOTALL)
+LINE = re.compile(r"^[ \t]*# *(\w+)[ =:]+(.*?)\s*$", re.MULTILINE)
 NUMBER = re.compile(r"([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*([^\W\d]*)")
+#: OME's description, and the texts of its authors in it.
+OF_OME = re.compile(r"<(\w+:)?OME\b.*", re.DOTALL)
+AUTHORS = re.compile(r"<(?:\w+:)?Description>([^<]*)<")
 #: A comma between thousands.
 THOUSANDS = re.compile(r"(?<=\d),(?=\d{3}(?!\d))")
 
@@ -146,14 +154,21 @@ def without_own_id(text: str) -> str:
 
 @lru_cache(maxsize=32)
 def unknown_parts(text: str) -> list[str]:
-    """What a text states beside the entries of `KEYS`; but no entry whose value is zero, empty or a
-    word such as "off", and nothing of OME's and MetaMorph's texts.
+    """What a text states beside the entries of `KEYS` and `TEXTS`, but no entry whose value is
+    zero, empty or a word such as "off". Of OME's text these are the parts of its authors'
+    descriptions; that of MetaMorph has none.
     """
-    if OME.search(text) or text.startswith("<MetaData"):
+    if text.startswith("<MetaData"):
         return []
+    text = OF_OME.sub(lambda found: "\n".join(AUTHORS.findall(found[0])), text)
     program = next((name for name, mark in MARKS.items() if re.search(mark, text, re.M)), "text")
-    stated = {f"{program}: {part}": value for part, value in statements(text).items()}
-    return [name.removeprefix(f"{program}: ") for name in unknown_entries(stated, KEYS)]
+    if program == "Dectris":
+        text = LINE.sub(r"\1: \2", text)
+    parts = {f"{program}: {name}": (name, *found) for name, found in statements(text).items()}
+    unknown = unknown_entries({key: value for key, (_, value, _) in parts.items()}, KEYS)
+    others = {*unknown_names(map(str.lower, unknown), [TEXTS])}
+    shown = {key: brief(*parts[key]) for key in unknown}
+    return [text for key, text in shown.items() if key.lower() in others or text != parts[key][0]]
 
 
 @lru_cache(maxsize=4)
@@ -268,9 +283,8 @@ def of_page(file: Path, head: Header, text: str, manager: Any) -> Header:
                 value = value.get("PropVal") if isinstance(value, dict) else value
                 _add(stated, f"Micro-Manager {name}", 0, str(value))
     head = head._replace(stated=stated)
-    entries = dict(LINE.findall(text)) if "#" in text else {}
-    if {"Exposure_time", "Count_cutoff", "N_excluded_pixels"} & {*entries}:
-        return _of_dectris(file, head, entries)
+    if re.search(MARKS["Dectris"], text, re.M):
+        return _of_dectris(file, head, dict(LINE.findall(text)))
     return head
 
 
@@ -327,6 +341,13 @@ def of_file(file: Path, head: Header, text: str, own: Sequence[PlaceInSet]) -> H
     """
     stated = {name: list(texts) for name, texts in head.stated.items()}
     for _, pixels in elements(text, "Pixels"):
+        size = tuple(int(pixels.get(f"Size{a}", n)) for a, n in zip("YX", head.shape, strict=True))
+        if size != head.shape:
+            raise Refused(
+                f"{file}: expected {size[0]} x {size[1]} pixels by OME's SizeY and SizeX, got "
+                f"{head.shape[0]} x {head.shape[1]}; were the images cut or turned? Save them "
+                f"without that description"
+            )
         kind = pixels.get("Type", "")
         if np.dtype(TYPES.get(kind, head.dtype)) != head.dtype.newbyteorder("="):
             raise Refused(f"{file}: expected pixels of OME's Type {kind}, got {head.dtype}")

@@ -13,7 +13,7 @@ from mvrecon.core.files.checks import EDGE, Refused
 from mvrecon.core.files.keys import Key, check_keys, unknown_names
 from mvrecon.data.projections import descriptions
 from mvrecon.data.projections.stack import Header
-from mvrecon.data.projections.tiff import EXIF_BEAM
+from mvrecon.data.projections.tiff import EXIF_BEAM, TIFF_KEYS
 
 #: Pixel types of a grey PNG by Pillow's mode.
 MODES = {"1": "?", "L": "u1", "I;16": "u2", "I;16B": "u2", "I": "i4"}
@@ -57,6 +57,8 @@ PNG_KEYS = (
     Key("pHYs, oFFs, sCAL", "ignored", "origin and print size"),
     Key("sBIT", "ignored", "values of fewer bits are scaled to all bits"),
 )
+#: Keys of EXIF, which are tags of TIFF: of those to refuse there, the others are named.
+EXIF_KEYS = [key for key in TIFF_KEYS if key.use != "refused"]
 #: Passes of a plain and of an interlaced PNG: first column and row, and their steps.
 PLAIN = [(0, 0, 1, 1)]
 INTERLACED = [
@@ -76,12 +78,14 @@ def png_header(file: Path) -> Header:
         exif = _exif(image) if "eXIf" in chunks else {}
         stated |= {f"eXIf: {name}": value for name, value in exif.items()}
         check_keys(file, PNG_KEYS, stated.get)
-        texts = image.text.items() if {*TEXTS} & {*chunks} else ()
+        texts = [*image.text.items()] if {*TEXTS} & {*chunks} else []
+        texts.append(("ImageDescription", str(exif.get("ImageDescription", ""))))
         parts = [
             f"text: {part}"
             for name, text in texts
-            for part in descriptions.unknown_parts(f"{name}: {text}")
+            for part in descriptions.unknown_parts(f"{name.replace(':', '.')}: {text.strip()}")
         ]
+        parts += [f"eXIf: {name}" for name in unknown_names(exif, EXIF_KEYS)]
         kind = MODES.get(image.mode)
         if kind is None or max(rows, columns) > EDGE:
             raise Refused(
@@ -101,14 +105,14 @@ def png_header(file: Path) -> Header:
 
 
 def _exif(image: Any) -> dict[str, Any]:
-    """The entries of EXIF by their names; ratios as numbers."""
-    from PIL import ExifTags
+    """The entries of EXIF by their names as tags of TIFF; ratios as numbers."""
     from PIL.TiffImagePlugin import IFDRational
+    from tifffile import TIFF
 
     exif = image.getexif()
     return {
-        ExifTags.TAGS.get(tag, str(tag)): float(value) if isinstance(value, IFDRational) else value
-        for tag, value in {**exif, **exif.get_ifd(CAMERA)}.items()
+        TIFF.TAGS.get(tag, f"tag {tag}"): float(v) if isinstance(v, IFDRational) else v
+        for tag, v in {**exif, **exif.get_ifd(CAMERA)}.items()
     }
 
 

@@ -354,7 +354,6 @@ class ItkViews(ProjectionStack):
                     f"direction {(affine[:3, :2] / spacing).T.round(6).tolist()}"
                 )
             self.pixel_mm = (float(down), float(right))
-            self.detector = {"spacing": self.pixel_mm}
 
     def _block(self, first: int, last: int) -> np.ndarray:
         return self._image.read(first, last)

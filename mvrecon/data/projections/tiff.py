@@ -20,7 +20,7 @@ EXIF_BEAM = ("ISOSpeedRatings", "ISOSpeed", "GainControl", "FNumber", "ExposureB
 #: Tags that are stored as numerator and denominator.
 RATIOS = ("FNumber", "ExposureBiasValue", "Gamma", "BestQualityScale", "MDScalePixel")
 #: Items of GDAL that scale values: the role, and the number.
-SCALED = re.compile(r"<Item\b[^>]*\brole\s*=\s*[\"'](scale|offset)[\"'][^>]*>\s*([^<]*?)\s*<")
+SCALED = re.compile(r"<Item\b[^>]*\brole\s*=\s*[\"'](scale|offset)[\"'][^>]*>\s*([^<]*?)\s*<", re.I)
 #: Tags of Andor on which grey values depend likewise, beside its ExposureTime.
 ANDOR_BEAM = tuple(
     f"Andor{name}"
@@ -29,6 +29,9 @@ ANDOR_BEAM = tuple(
         *("BaselineOffset", "HorizontalFlip", "VerticalFlip", "Clockwise", "CounterClockwise"),
     )
 )
+#: Tags with texts of any program: tifffile writes two of the first, ImageJ keeps its Info in the
+#: second.
+TEXTS = ("ImageDescription", "IJMetadata", "GDAL_METADATA")
 #: First tag of areaDetector's attributes, which are texts `name:value`.
 AREA_DETECTOR = 65010
 #: Tags of TIFF that change the pixels or their order, and those that ordinary files have; a warning
@@ -80,7 +83,7 @@ TIFF_KEYS = (
     Key(", ".join(EXIF_BEAM), "compared", "of views and flat fields, also in EXIF; warned of"),
     Key(", ".join(ANDOR_BEAM), "compared", "of views and flat fields; warned of"),
     Key(
-        "ImageDescription: ..., areaDetector: ...",
+        "ImageDescription: ..., IJMetadata: Info ..., GDAL_METADATA: ..., areaDetector: ...",
         "ignored",
         "what other programs state; a warning names it, but entries of 0, off or nothing",
     ),
@@ -182,13 +185,14 @@ TIFF_KEYS = (
         "of EXIF",
     ),
     Key(
-        "IJMetadata*, MicroManagerMetadata, UIC1tag, UIC3tag, UIC4tag, CZ_SEM, CZ_LSMINFO, "
-        "FEI_*, FibicsXML, JEOL_Header, MM_*, OlympusINI, OlympusSIS*, PCO_RAW, Andor*, "
-        "tag 65000, tag 65001, tag 65002, tag 65003",
+        "IJMetadata, IJMetadataByteCounts, MicroManagerMetadata, UIC1tag, UIC3tag, UIC4tag, "
+        "CZ_SEM, CZ_LSMINFO, FEI_*, FibicsXML, JEOL_Header, MM_*, OlympusINI, OlympusSIS*, "
+        "PCO_RAW, Andor*, tag 65000, tag 65001, tag 65002, tag 65003",
         "ignored",
         "what the programs of microscopes and cameras store beside the pixels",
     ),
     *descriptions.KEYS,
+    descriptions.TEXTS,
 )
 
 
@@ -268,14 +272,15 @@ def _check_tags(file: Path, page: Any) -> None:
 def _names(page: Any) -> set[str]:
     """Names of the tags of a page and of its EXIF, and what its texts state."""
     names = {str(name) for name in page.tags.valueof("ExifTag") or ()}
-    texts = {"ImageDescription": [page.description]}
     for tag in page.tags:
-        if tag.code >= AREA_DETECTOR and isinstance(tag.value, str):
-            texts.setdefault("areaDetector", []).append(tag.value)
-        else:
+        of_camera = tag.code >= AREA_DETECTOR and isinstance(tag.value, str)
+        where = "areaDetector" if of_camera else tag.name
+        if not of_camera:
             names.add(f"tag {tag.name}" if tag.name.isdigit() else tag.name)
-    for where, own in texts.items():
-        names |= {f"{where}: {part}" for text in own for part in descriptions.unknown_parts(text)}
+        if of_camera or tag.name in TEXTS:
+            text = tag.value.get("Info", "") if isinstance(tag.value, dict) else tag.value
+            text = text.decode("utf-8", "replace") if isinstance(text, bytes) else str(text)
+            names |= {f"{where}: {part}" for part in descriptions.unknown_parts(text)}
     return names
 
 
@@ -294,8 +299,8 @@ def _offset(page: Any) -> bool:
     return _described(page).get("cf") == "signed" and page.dtype == "u2"
 
 
-#: Axes of a stack by ImageJ's description, and by OME's.
-AXES = re.compile(r"^\s*(channels|slices|frames)\s*=\s*(\d+)|\b(Size[CZT])=\"(\d+)\"", re.MULTILINE)
+#: Axes of a stack by the description of ImageJ and SCIFIO.
+AXES = re.compile(r"^[ \t]*(channels|slices|frames)[ \t]*=[ \t]*(\d+)", re.MULTILINE)
 
 
 def _behind(pages: Any, images: int) -> bool:
@@ -331,28 +336,31 @@ def _check_order(
                 f"save it without that description"
             )
         return
-    if not ("ImageJ" in text or descriptions.OME.search(text)):
-        return
-    axes = [(a or c, int(b or d)) for a, b, c, d in AXES.findall(text)]
+    axes = AXES.findall(text) if "ImageJ" in text or "SCIFIO" in text else []
+    ome = descriptions.elements(text, "Pixels")
+    sizes = [(f"Size{axis}", own.get(f"Size{axis}", 1)) for _, own in ome for axis in "CZT"]
+    axes = [(name, int(size)) for name, size in (*axes, *sizes)]
     running = [f"{name} {size}" for name, size in axes if size > 1]
     if len(running) > 1:
         raise Refused(
             f"{file}: expected images along one axis, got {' and '.join(running)} in its "
             f"ImageDescription; save the views as a stack of their own"
         )
-    if running and max(size for _, size in axes) != images:
+    stated = max([len(ome), *(size for _, size in axes)])
+    if (running or ome) and stated != images:
         raise Refused(
-            f"{file}: expected as many pages as its ImageDescription states, {running[0]}, got "
-            f"{images}; are the others in further files?"
+            f"{file}: expected as many pages as its ImageDescription states, "
+            f"{running[0] if running else stated}, got {images}; are the others in further files?"
         )
     planes = sorted(
-        (int(place.get("IFD", 0)), sum(int(place.get(f"First{axis}", 0)) for axis in "ZCT"))
-        for _, place in descriptions.elements(text, "TiffData")
+        (int(place.get("IFD", 0)), n, sum(int(place.get(f"First{axis}", 0)) for axis in "ZCT"))
+        for n, place in descriptions.elements(text, "TiffData")
     )
-    if planes != sorted(planes, key=lambda plane: plane[1]):
+    if planes != sorted(planes, key=lambda plane: plane[1:]):
+        order = [n - 1 if len(ome) > 1 else k for _, n, k in planes]
         raise Refused(
             f"{file}: expected pages in the order of TiffData in its ImageDescription, got the "
-            f"images {shown([image for _, image in planes])}; sort the pages, and save them again"
+            f"images {shown(order)}; sort the pages, and save them again"
         )
 
 
@@ -388,6 +396,7 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
             f"{file}: expected {segments} strips or tiles of at most {EDGE} x {EDGE} pixels, got "
             f"{sum(map(bool, page.databytecounts))} with data; is it cut short?"
         )
+    _check_words(file, page)
     bits = page.bitspersample - (kind.kind == "i")
     top = None if kind.kind == "f" else float(2**bits - 1)
     exposed = [page.tags.valueof(name) for name in ("ExposureTime", "AndorExposureTime")]
@@ -402,6 +411,25 @@ def _page_header(file: Path, page: Any, pages: int) -> Header:
     head = Header((rows, columns), kind, pages, frozenset([top]), stated=stated)
     manager = page.tags.valueof("MicroManagerMetadata")
     return descriptions.of_page(file, head, page.description, manager)
+
+
+def _check_words(file: Path, page: Any) -> None:
+    """Raise for numbers that programs read differently, as other values than were written."""
+    bits, (*_, rows, columns) = page.bitspersample, page.chunks
+    room = len(page.databytecounts) * (1 + rows * math.ceil(columns * bits / 8))
+    if page.compression == 1 and bits % 8 and sum(page.databytecounts) > room:
+        raise Refused(
+            f"{file}: expected at most {room} bytes of pixels of {bits} packed bits "
+            f"(BitsPerSample), got {sum(page.databytecounts)}; state the bits of the words that "
+            f"contain them, and give the greatest value as views.saturation"
+        )
+    if bits == 24 and page.dtype.kind in "iu":
+        raise Refused(f"{file}: expected integers of 8, 16 or 32 bits, got 24, of either order")
+    if page.predictor != 1 and page.compression in (1, 32773):
+        raise Refused(
+            f"{file}: expected no Predictor without LZW or another compression to which it "
+            f"belongs, got {int(page.predictor)}, which some programs apply; store the values"
+        )
 
 
 def tiff_pages(file: Path, first: int, last: int) -> Iterator[np.ndarray]:

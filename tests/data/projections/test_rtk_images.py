@@ -291,7 +291,7 @@ def test_properties_of_xim_are_compared_or_named(tmp_path):
     assert rtk_images._check_xim(path) == ({**exposures, **beam}, [])
     changed = {"DataGain": 2.0, "DataOffset": 100.0, "AcquisitionNotes": "scaled by 2"}
     xim(path, values, **{**TRUEBEAM, **changed})
-    unknown = ["DataGain", "DataOffset", "AcquisitionNotes: scaled by"]
+    unknown = ["DataGain", "DataOffset", "AcquisitionNotes: scaled by 2"]
     assert rtk_images._check_xim(path)[1] == unknown
 
 

@@ -1,5 +1,6 @@
 """TIFF images of tifffile, Pillow and SimpleITK: every type and tag is applied or refused."""
 
+import struct
 import warnings
 
 import numpy as np
@@ -279,6 +280,59 @@ def test_a_stack_of_two_axes_or_of_several_files_is_refused(options, message, tm
         open_projections(path)
 
 
+SCIFIO = "SCIFIO=0.37.3\naxes=X,Y,Channel,Time\nimages=12\nchannels={}\nslices=1\nframes={}\n"
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"SizeZ": 12}, None),
+        ({"SizeZ": 6, "SizeC": 2}, "SizeC 2 and SizeZ 6"),
+        ({}, "states, 1, got 12"),
+        ({"SizeZ": 12, "SizeX": 6, "SizeY": 8}, "8 x 6 pixels by OME's SizeY and SizeX, got 6 x 8"),
+        ("SCIFIO", "channels 2 and frames 6"),
+    ],
+)
+@pytest.mark.parametrize("equals", ['{}="{}"', "{}='{}'", '{} = "{}"'])
+def test_axes_are_read_however_they_are_quoted(equals, sizes, message, tmp_path):
+    """Also with other numbers in what OME quotes of another program."""
+    if sizes == "SCIFIO":
+        text = SCIFIO.format(2, 6)
+    else:
+        pixels = " ".join(equals.format(*item) for item in sizes.items())
+        other = '<OriginalMetadata><x SizeC="2" SizeT="3"/></OriginalMetadata>'
+        text = f"<OME><Image><Pixels {pixels}><TiffData/></Pixels></Image>{other}</OME>"
+    path = written(tmp_path / "a.tif", grey(), description=text)
+    if message is None:
+        assert np.array_equal(open_projections(path).read(0, 12), grey())
+    else:
+        with pytest.raises(Refused, match=message):
+            open_projections(path)
+
+
+@pytest.mark.parametrize(
+    ("tag", "value", "message"),
+    [
+        ("BitsPerSample", 12, "73 bytes of pixels of 12 packed bits .* got 96"),
+        ("BitsPerSample", 24, "8, 16 or 32 bits, got 24"),
+        ("Predictor", 2, "no Predictor without LZW"),
+    ],
+)
+def test_pixels_that_programs_read_differently_are_refused(tag, value, message, tmp_path):
+    """Words of 16 bits whose tag states their 12 significant bits, as some cameras write them,
+    which are no packed bits; 24 bits, which tifffile reads as big-endian always; and differences of
+    pixels without compression, which libtiff never applies.
+    """
+    values = grey()[0] if value != 24 else grey()[0, :, :4].astype("u4")
+    path = written(tmp_path / "a.tif", values, extratags=[(40123, "H", 1, 1, True)])
+    predictor = path.read_bytes().replace(struct.pack("<HH", 40123, 3), struct.pack("<HH", 317, 3))
+    path.write_bytes(predictor)
+    with tifffile.TiffFile(path, mode="r+b") as file:
+        file.pages[0].tags[tag].overwrite(value)
+    with pytest.raises(Refused, match=message):
+        open_projections(path)
+
+
 @pytest.mark.parametrize("options", [{"imagej": True}, {"ome": True}, {"ome": True, "axis": "C"}])
 def test_a_stack_of_one_axis_is_read_in_its_order(options, tmp_path):
     """With ImageJ's and OME's pixel sizes, which the camera has."""
@@ -302,6 +356,18 @@ def test_pages_of_ome_are_in_the_order_of_its_description(reverse, tmp_path):
             open_projections(tmp_path / "a.tif")
     else:
         assert np.array_equal(open_projections(tmp_path / "a.tif").read(0, 12), grey())
+
+
+@pytest.mark.parametrize("pages", [(0, 1, 2), (2, 1, 0)])
+def test_pages_of_several_images_of_ome_are_in_their_order(pages, tmp_path):
+    image = '<Image><Pixels SizeX="8" SizeY="6"><TiffData IFD="{}"/></Pixels></Image>'
+    text = f"<OME>{''.join(map(image.format, pages))}</OME>"
+    path = written(tmp_path / "a.tif", grey()[:3], description=text)
+    if pages == (0, 1, 2):
+        assert np.array_equal(open_projections(path).read(0, 3), grey()[:3])
+    else:
+        with pytest.raises(Refused, match="order of TiffData"):
+            open_projections(path)
 
 
 def test_pages_that_are_not_in_the_order_of_their_numbers_are_refused(tmp_path):

@@ -120,7 +120,7 @@ TEXTS = {
     ],
     "Slope\t2\nIntercept\t0": ["Slope"],
     "<a><slope>0.5</slope><b offset='3'/></a>": ["slope", "b offset"],
-    "<e><name>slope</name><value>2</value></e>": ["name", "value"],
+    "<e><name>slope</name><value>2</value></e>": ["name = slope", "value"],
     "1.5 mm of aluminium\ndivided by the ring's current": [
         *("1.5 mm of aluminium", "divided by the ring's current"),
     ],
@@ -129,14 +129,38 @@ TEXTS = {
     "ImageJ=1.54f\nimages=1\ngain=3": ["gain"],
     "SCIFIO=0.37\nscales=0.5,0.5\nunits=micron,micron\nimages=1": [],
     '<MetaData><prop id="autoscale-state" value="on"/></MetaData>': [],
-    "a" * 10**6 + "gain": ["a" * 80 + "..."],
+    "a" * 10**6: ["a" * 80 + "..."],
+    "a" * 10**6 + "gain": ["..." + "a" * 76 + "gain"],
     "a=2\nb: 100": ["a", "b"],
     '[Acquisition],NrExposure="2",AcqMode="5",[Grabber],CCDGain=3,Lens=0': [
         *("Acquisition", "NrExposure", "AcqMode", "Grabber", "CCDGain"),
     ],
     '{"x": {"scale": 2}, "y": {"scale": 1}}': ["x.scale"],
-    '[{"scale": 1}, {"scale": 2}]': ["scale"],
+    '[{"scale": 1}, {"scale": 2}]': ["scale = 2"],
     "<a><b><gain>2</gain></b><c><gain>1</gain></c></a>": ["gain"],
+    # Known texts that state more, or whose names are longer than known ones.
+    "Date: 2020-01-01 Gain: 4": ["Date: 2020-01-01 Gain: 4"],
+    "Title: scaled by 2\nAuthor: me": ["Title: scaled by 2"],
+    "software_gain=2\nhostgain=3": ["software_gain", "hostgain"],
+    '{"date": {"gain": 2}}': ["date.gain"],
+    "FileName: D:\\a_1.tif\nTime: 2020-01-01T12:00:00Z": [],
+    # Names of detectors of Dectris in another text.
+    "# Flat_field corrected\n# Tau = 2 s": ["Flat_field corrected", "Tau"],
+    # Numbers and lists below their name, as JSON is indented.
+    '{\n "gain":\n  2,\n "matrix": [\n  [\n   1,\n   2\n  ]\n ]\n}': ["gain", "matrix"],
+    # Names that differ in case alone.
+    "Gain=2\ngain=0": ["Gain"],
+    # Comments, marks at the start of lines, and lines of a letter.
+    "<?xml version='1.0'?><a><!-- scaled by 2 --></a>": ["scaled by 2"],
+    "<a><gain>1</gain></a>": [],
+    "!inverted\n// bias=5\nx 0.001": ["inverted", "bias", "x 0.001"],
+    # What is cut off has no word of an effect.
+    "x" * 300 + " multiplied by 5": ["..." + "x" * 64 + " multiplied by 5"],
+    "bias=2\0scale=3\0": ["bias", "scale"],
+    # Texts around OME's description, and of its authors.
+    "bias=5\n<OME><Image><Description>gain=2</Description><Pixels/></Image></OME>": [
+        *("bias", "gain"),
+    ],
 }
 
 
@@ -145,6 +169,21 @@ def test_what_a_description_states_is_named(text, tmp_path):
     expected = ", ".join(f"ImageDescription: {name}" for name in TEXTS[text])
     found = named(tiffs(tmp_path, text=text), **GIVEN)
     assert found == sorted(expected.split(", ") if expected else [])
+
+
+def test_texts_of_other_tags_are_named(tmp_path):
+    """The second description that tifffile writes, ImageJ's Info, and GDAL's items."""
+    scale, own = tmp_path / "a.tif", {"photometric": "minisblack"}
+    tifffile.imwrite(scale, grey(), description="a text", metadata={"scale": 2}, **own)
+    assert named(scale, **GIVEN) == ["ImageDescription: a text", "ImageDescription: scale"]
+    tifffile.imwrite(scale, grey(), imagej=True, metadata={"Info": "Scale: 2"})
+    assert named(scale, **GIVEN) == ["IJMetadata: Scale"]
+    tifffile.imwrite(scale, grey(), imagej=True, metadata={"Labels": ["a"] * len(grey())})
+    assert named(scale, **GIVEN) == []
+    item = '<GDALMetadata><Item name="unit">1/cm</Item></GDALMetadata>'
+    tag = [(42112, "s", 0, item, True)]
+    tifffile.imwrite(scale, grey(), metadata=None, extratags=tag, **own)
+    assert named(scale, **GIVEN) == ['GDAL_METADATA: Item name="unit" = 1/cm']
 
 
 def test_names_with_words_of_an_effect_come_first(tmp_path):
@@ -200,6 +239,19 @@ def test_chunks_and_texts_of_png_that_no_reader_knows_are_named(case, packed, tm
         more = b"".join(head + struct.pack(">I", zlib.crc32(head[4:])) for head in heads)
         path.write_bytes(path.read_bytes()[:33] + more + path.read_bytes()[33:])
     assert named(tmp_path, **GIVEN) == expected
+
+
+def test_exif_and_its_texts_in_png_are_named(tmp_path):
+    """Entries of cameras are known; those that TIFF refuses but PNG does not are named."""
+    for entries, expected in (
+        ({271: "a", 531: 1, 50714: 64}, ["eXIf: BlackLevel"]),
+        ({270: "gain=2", 37510: "a"}, ["eXIf: UserComment", "text: ImageDescription: gain=2"]),
+    ):
+        for k in range(3):
+            exif = Pillow.Exif()
+            exif.update(entries)
+            Pillow.fromarray(grey()[k]).save(tmp_path / f"{k}.png", exif=exif)
+        assert named(tmp_path, **GIVEN) == expected
 
 
 @pytest.mark.parametrize(
@@ -463,7 +515,7 @@ def nrrd(path, *lines, values=None):
 
 
 TEXTS_OF_ITK = {
-    "values multiplied by 1000": ["values multiplied by"],
+    "values multiplied by 1000": ["values multiplied by 1000"],
     "slope = 2; knee": ["slope"],
     "-log(I/I0)": ["-log(I/I0)"],
     "RTK's projections of a phantom, 0.5 mm of aluminium": [],
