@@ -538,6 +538,60 @@ def test_virtual_frames_have_the_part_of_the_detector_of_their_files(tmp_path):
         opened(path)
 
 
+VALUES, EVERY = frames(), slice(None)
+HEAD, TAIL = slice(len(KEYS) // 2), slice(len(KEYS) // 2, None)
+TWICE = np.stack([VALUES, VALUES + 1], 1).reshape(-1, ROWS, COLUMNS)
+#: Parts of virtual frames: of each its frames, the values of its data set, and the frames of these.
+PARTS = {
+    "the last first": [(TAIL, VALUES[TAIL], EVERY), (HEAD, VALUES[HEAD], EVERY)],
+    "of two writers in turn": [(slice(k, None, 2), VALUES[k::2], EVERY) for k in (1, 0)],
+    "each second frame": [(EVERY, TWICE, slice(None, None, 2))],
+    "an image each": [(k, VALUES[k], EVERY) for k in range(len(KEYS))],
+    "another order of bytes": [(EVERY, VALUES.astype(">u2"), EVERY)],
+}
+NO_PARTS = {
+    "some twice": [
+        (HEAD, VALUES[HEAD], EVERY),
+        (slice(1, 11), VALUES[TAIL], EVERY),
+    ],
+    "some of none": [(HEAD, VALUES[HEAD], EVERY)],
+    "rows": [
+        ((EVERY, slice(3)), VALUES[:, :3], EVERY),
+        ((EVERY, slice(3, 6)), VALUES[:, 3:], EVERY),
+    ],
+    "a type that holds more": [(EVERY, VALUES.astype("u4") + 2**16, EVERY)],
+}
+
+
+def virtual_of(path, parts):
+    """An NXtomo file whose frames are virtual, of such parts."""
+    layout = h5py.VirtualLayout(VALUES.shape, VALUES.dtype)
+    with h5py.File(path.parent / "parts.h5", "w") as file:
+        for k, (target, values, own) in enumerate(parts):
+            file[f"part{k}"] = values
+            source = h5py.VirtualSource("parts.h5", f"part{k}", values.shape, values.dtype)
+            layout[target] = source[own]
+    tomo(path)
+    with h5py.File(path, "a") as file:
+        del file["entry/instrument/detector/data"]
+        file.create_virtual_dataset("entry/instrument/detector/data", layout)
+    return path
+
+
+@pytest.mark.parametrize("form", PARTS)
+def test_virtual_frames_are_those_that_hdf5_reads(form, tmp_path):
+    """Whatever the order of their parts, and the steps in which these are taken."""
+    views = opened(virtual_of(tmp_path / "a.nxs", PARTS[form])).whole().views
+    assert np.allclose(views, integrals(), atol=1e-6)
+
+
+@pytest.mark.parametrize("form", NO_PARTS)
+def test_virtual_frames_that_are_not_each_one_whole_frame_are_refused(form, tmp_path):
+    """Tried beside these: parts without limits, and columns of frames."""
+    with pytest.raises(Refused, match="virtual frames|each of .* frames once"):
+        opened(virtual_of(tmp_path / "a.nxs", NO_PARTS[form]))
+
+
 @pytest.mark.parametrize("name", ["/", "entry", "entry/sample", "entry/instrument/detector/data"])
 def test_the_kind_of_a_scale_of_a_plot_is_no_scale(name, tmp_path):
     """As nxtomo writes it for silx. Neutral numbers of each axis change nothing; others do."""
