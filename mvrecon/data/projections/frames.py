@@ -22,7 +22,7 @@ from mvrecon.data.linked import (
     followed,
     numbers_at,
     units_of,
-    unknown_attributes,
+    unknown_around,
 )
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
@@ -81,7 +81,7 @@ class Frames:
         self._own = np.concatenate([part.own for part in parts])[order]
         self.region = {name: self._common(name) for name in REGION}
         places = dict.fromkeys([place, *self.parts])
-        self.unknown = [name for one in places for name in unknown_attributes(one)]
+        self.unknown = [name for one in places for name in unknown_around(one)]
         self.units = units_of([*places])
 
     def _common(self, name: str) -> np.ndarray | None:
