@@ -43,9 +43,9 @@ ATTRIBUTES = (
     ),
     Key(
         "NX_class, long_name, target, signal, primary, axis, interpretation, description, name, "
-        "local_name, title, label, comment, source, date, timestamp, start_time, end_time, "
-        "creator, *version, *Version, NeXus_*, publisher, program, author, user, operator, "
-        "facility, beamline, history, uncertainties, check_sum, default, default_slice, "
+        "local_name, short_name, title, label, comment, source, date, timestamp, start_time, "
+        "end_time, creator, *version, *Version, NeXus_*, publisher, program, author, user, "
+        "operator, facility, beamline, history, uncertainties, check_sum, default, default_slice, "
         "auxiliary_signals, SILX_style*, NDArrayNumDims, NDArrayColorMode, NDAttr*, image_nr_*, "
         "decimals, file_*, equipment_component",
         "ignored",

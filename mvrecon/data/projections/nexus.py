@@ -156,12 +156,8 @@ KEYS = (
     *nexus_detector.KEYS,
     *nexus_axes.KEYS,
 )
-#: Words of fields beside the frames that a warning names, and their values that change nothing.
-FIELD_EFFECTS = {
-    **IMAGE_EFFECTS,
-    "time_of_flight|mask|bad.?pixel|shift|displace|jitter": 0,
-    "binning": 1,
-}
+#: Words of fields beside the frames by the values of these that change nothing; of others it is 0.
+FIELD_EFFECTS = {**IMAGE_EFFECTS, "binning": 1}
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Pixels by which a sample may move between views.
