@@ -43,10 +43,11 @@ ATTRIBUTES = (
     ),
     Key(
         "NX_class, long_name, target, signal, primary, axis, interpretation, description, name, "
-        "local_name, title, label, comment, source, date, timestamp, start_time, end_time, "
-        "creator, version, history, uncertainties, check_sum, default, SILX_style*, "
-        "NDArrayNumDims, NDArrayColorMode, NDAttr*, image_nr_*, decimals, file_name, "
-        "equipment_component",
+        "local_name, short_name, title, label, comment, source, date, timestamp, start_time, "
+        "end_time, creator, *version, *Version, NeXus_*, publisher, program, author, user, "
+        "operator, facility, beamline, history, uncertainties, check_sum, default, default_slice, "
+        "auxiliary_signals, SILX_style*, NDArrayNumDims, NDArrayColorMode, NDAttr*, image_nr_*, "
+        "decimals, file_*, equipment_component",
         "ignored",
         "texts, links and plots of NeXus and areaDetector",
     ),
@@ -56,9 +57,10 @@ ATTRIBUTES = (
         "of the values as they are stored; the last four of CIL",
     ),
     Key(
-        "CLASS, NAME, VERSION, TITLE, FLAVOR, EXTDIM, REFERENCE_LIST, DIMENSION_LIST, IMAGE_*, "
-        "INTERLACE_MODE, PALETTE, MATLAB_*, H5PATH, _Netcdf4*, _NC*, coordinates, standard_name, "
-        "institution, references, Conventions, cell_methods, grid_mapping, actual_range",
+        "CLASS, NAME, *VERSION, TITLE, FLAVOR, FILTERS, EXTDIM, REFERENCE_LIST, DIMENSION_LIST, "
+        "IMAGE_*, INTERLACE_MODE, PALETTE, MATLAB_*, H5PATH, _Netcdf4*, _NC*, coordinates, "
+        "standard_name, institution, references, Conventions, cell_methods, grid_mapping, "
+        "actual_range",
         "ignored",
         "of HDF5, MATLAB and netCDF, and of the display",
     ),
@@ -160,20 +162,33 @@ def check_around(place: Place) -> None:
         Refused: an attribute of a group, or a field in it, that scales the data set; not the
             category of units that nxtomo writes to transformations (NX_TRANSFORMATION).
     """
+    for group, part in _around(place):
+        category = texts_at([group], "units").get(group, "").startswith("NX_")
+        with opened(group.path) as file:
+            check_attributes(group.path, file[group.name], UNITS if category else ())
+            check_fields(group.path, file[group.name], part)
+
+
+def _around(place: Place) -> Iterator[tuple[Place, str]]:
+    """The groups in which a data set and the links to it are, outer ones first, with the names of
+    their members that lead to it.
+    """
     for path, name, _ in (place, *place.links):
-        with opened(path) as file:
-            group: h5py.Group = file
-            for part in name.strip("/").split("/"):
-                own = Place(path, group.name)
-                category = texts_at([own], "units").get(own, "").startswith("NX_")
-                check_attributes(path, group, UNITS if category else ())
-                check_fields(path, group, part)
-                if isinstance(group.get(part, getlink=True), h5py.HardLink):
-                    group = group[part]  # type: ignore[assignment]
+        parts = name.strip("/").split("/")
+        for k, part in enumerate(parts):
+            yield Place(path, "/" + "/".join(parts[:k])), part
+
+
+def unknown_around(place: Place) -> list[str]:
+    """The unknown attributes of a data set and of the groups in which it and the links to it are;
+    see `unknown_attributes`.
+    """
+    holders = dict.fromkeys([place, *(group for group, _ in _around(place))])
+    return [name for one in holders for name in unknown_attributes(one)]
 
 
 def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
-    """The attributes of a data set that neither its reader nor `ATTRIBUTES` know, as
+    """The attributes of a data set or group that neither its reader nor `ATTRIBUTES` know, as
     <data set>@<name>; not those that are zero.
 
     Raises:
@@ -187,7 +202,7 @@ def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
             for name in stored.attrs
             if not has_effect(name, "") and value_in(stored, name, stored.attrs.get_id(name)) != 0
         ]
-    own = place.name.rpartition("/")[2]
+    own = place.name.rpartition("/")[2] or "/"
     return [f"{own}@{name}" for name in unknown_names(names, ATTRIBUTES) if name not in known]
 
 

@@ -241,20 +241,19 @@ def unknown_members(path: Path, file: h5py.File, known: Sequence[str]) -> list[s
 
 
 def fields_in(group: h5py.Group, effects: Mapping[str, Any]) -> list[str]:
-    """Names of the data sets in a group that have at most one axis or a word of `effects`, and of
-    links with such a word, which are not followed; not the axes of other data sets, nor those whose
-    value is 0 or, as a gain of 1, changes nothing.
+    """Names of the data sets in a group and of links, which are not followed; not the axes of other
+    data sets, nor those whose value is 0 or, as a gain of 1, changes nothing.
     """
     found = []
     for name in group:
         link = group.get(name, getlink=True)
         field = group[name] if isinstance(link, h5py.HardLink) else link
-        word = has_effect(name, "", effects)
-        small = isinstance(field, h5py.Dataset) and field.ndim < 2 and not field.is_scale
-        if (small or word) and not isinstance(field, h5py.Group):
-            value = value_in(group, name, field)
-            if has_effect(name, value, effects) if word else value != 0:
-                found.append(name)
+        axis = isinstance(field, h5py.Dataset) and field.is_scale
+        if axis or isinstance(field, h5py.Group | h5py.Datatype):
+            continue
+        value = value_in(group, name, field)
+        if has_effect(name, value, effects) if has_effect(name, "", effects) else value != 0:
+            found.append(name)
     return found
 
 
@@ -270,7 +269,7 @@ def _check_effect(path: Path, holder: Any, name: str, kind: Any, what: str) -> N
 def value_in(holder: Any, name: str, kind: Any) -> Any:
     """A number of an attribute of a holder, or of a field in it; its type if it has others."""
     value = type(kind).__name__  # of a link, which is not followed
-    if hasattr(kind, "dtype"):
+    if hasattr(kind, "shape"):
         few = kind.shape is not None and 0 < math.prod(kind.shape) <= MAX_NUMBERS
         own = holder.attrs if isinstance(kind, h5py.h5a.AttrID) else holder
         numbers = np.ravel(own[name]) * 1 if few and kind.dtype.kind in "biuf" else np.zeros(0)

@@ -14,6 +14,7 @@ from torch import Tensor
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.dicom_image import same
 from mvrecon.data.linked import (
+    MAX_VALUES,
     UNITS,
     Place,
     beside,
@@ -21,7 +22,7 @@ from mvrecon.data.linked import (
     followed,
     numbers_at,
     units_of,
-    unknown_attributes,
+    unknown_around,
 )
 from mvrecon.data.projections.stack import VIEWS, ProjectionStack
 from mvrecon.data.storage import check_attributes, check_chunks, dataset_in, opened
@@ -32,12 +33,12 @@ REGION = ("NDArrayDimOffset", "NDArrayDimBinning", "NDArrayDimReverse")
 SELECTS_ALL = 3
 
 
-class Segment(NamedTuple):
-    """Consecutive frames of a data set."""
+class Part(NamedTuple):
+    """Frames of a virtual data set, and those of another data set that they are, by numbers."""
 
+    frames: np.ndarray
     place: Place
-    first: int
-    count: int
+    own: np.ndarray
 
 
 class Frames:
@@ -57,88 +58,86 @@ class Frames:
             stored: Any = file[place.name]
             if not isinstance(stored, h5py.Dataset):
                 raise Refused(f"{place}: expected a data set of frames, got a group")
-            if not (stored.ndim in (2, 3) and stored.dtype.kind in "iuf"):
+            few = stored.ndim in (2, 3) and stored.shape[0] <= MAX_VALUES
+            if not few or stored.dtype.kind not in "biuf":
                 got = f"{stored.dtype} {stored.shape}"
                 raise Refused(f"{place}: expected numbers [m v u] of frames, got {got}")
             self.shape = (1,) * (3 - stored.ndim) + stored.shape
             self.dtype = stored.dtype
             check_attributes(place.path, stored, (*UNITS, *REGION))
             check_around(place)
-            if not stored.is_virtual:
-                self.parts = [Segment(place, 0, self.shape[0])]
-            else:
-                self.parts = [self._part(source, folder) for source in stored.virtual_sources()]
-        ends = np.cumsum([0, *(part.count for part in self.parts)])
-        if ends[-1] != self.shape[0]:
+            whole = Part(np.arange(self.shape[0]), place, np.arange(self.shape[0]))
+            virtual = stored.virtual_sources() if stored.is_virtual else None
+            parts = [whole] if virtual is None else [self._part(one, folder) for one in virtual]
+        numbers = np.concatenate([part.frames for part in parts])
+        if not np.array_equal(np.sort(numbers), np.arange(self.shape[0])):
             raise Refused(
-                f"{place}: expected parts with all {self.shape[0]} frames, got {ends[-1]}"
+                f"{place}: expected parts with each of {self.shape[0]} frames once, got "
+                f"{len(numbers)} of {len({*numbers.tolist()})}"
             )
-        self._ends = ends.tolist()
+        order = np.argsort(numbers)
+        self.parts = [part.place for part in parts]
+        self._part_of = np.repeat(np.arange(len(parts)), [len(p.frames) for p in parts])[order]
+        self._own = np.concatenate([part.own for part in parts])[order]
         self.region = {name: self._common(name) for name in REGION}
-        places = dict.fromkeys([place, *(part.place for part in self.parts)])
-        self.unknown = [name for one in places for name in unknown_attributes(one)]
+        places = dict.fromkeys([place, *self.parts])
+        self.unknown = [name for one in places for name in unknown_around(one)]
         self.units = units_of([*places])
 
     def _common(self, name: str) -> np.ndarray | None:
         """An attribute of the data set, and of those of its parts; None if they have none."""
-        places = dict.fromkeys([self.place, *(part.place for part in self.parts)])
+        places = dict.fromkeys([self.place, *self.parts])
         stated = [numbers_at(place, name) for place in places]
         known = [numbers for numbers in stated if numbers is not None]
         if other := [numbers for numbers in known if not same(numbers, known[0])]:
             raise Refused(f"{self.place}: expected one {name}, got {known[0]} and {other[0]}")
         return known[0] if known else None
 
-    def _part(self, source: Any, folder: Path) -> Segment:
-        """A part of a virtual data set, which follows the part before it."""
+    def _part(self, source: Any, folder: Path) -> Part:
+        """A part of a virtual data set."""
         path = self.place.path
         if source.file_name != ".":
             path = beside(path, source.file_name, self.place.name, folder)
-        found, rows = followed(path, source.dset_name, folder), self.shape[1:]
+        found = followed(path, source.dset_name, folder)
         if found is not None:
             with opened(found.path) as file:
                 stored = dataset_in(found.path, file, found.name)
                 check_attributes(found.path, stored, (*UNITS, *REGION))
-                shape = stored.shape
+                shape, fits = stored.shape, np.can_cast(stored.dtype, self.dtype)
             check_around(found)
-            start, end = source.vspace.get_select_bounds()
-            first, count = 0, end[0] - start[0] + 1
-            pixels = [source.vspace.get_select_npoints()]
-            if source.src_space.get_select_type() != SELECTS_ALL:
-                first = source.src_space.get_select_bounds()[0][0]
-                pixels.append(source.src_space.get_select_npoints())
-            elif shape[0] != count:
-                first = -1
-            if shape[1:] == rows and {*pixels} == {count * math.prod(rows)}:
-                if 0 <= first <= shape[0] - count:
-                    return Segment(found, first, count)
+            frames = _whole_frames(source.vspace, self.shape)
+            own = _whole_frames(source.src_space, shape)
+            same_size = len(shape) in (2, 3) and shape[-2:] == self.shape[1:]
+            if fits and same_size and 0 < len(frames) == len(own):
+                return Part(frames, found, own)
         raise Refused(
-            f"{self.place}: expected virtual frames that are whole frames of other data sets, got "
-            f"others of {path}:{source.dset_name}; h5repack makes one file of them"
+            f"{self.place}: expected virtual frames that are whole frames of other data sets, of a "
+            f"type that {self.dtype} holds, got others of {path}:{source.dset_name}; h5repack "
+            f"makes one file of them"
         )
 
     def read(self, numbers: np.ndarray) -> np.ndarray:
         """The frames of increasing numbers."""
         out = np.empty((len(numbers), *self.shape[1:]), self.dtype)
-        for part, begin, end in zip(self.parts, self._ends, self._ends[1:], strict=False):
-            inside = np.flatnonzero((numbers >= begin) & (numbers < end))
-            if not len(inside):
-                continue
-            wanted = numbers[inside] - begin + part.first
-            with opened(part.place.path) as file:
-                stored = dataset_in(part.place.path, file, part.place.name)
-                if stored.dtype.kind not in "iuf" or stored.shape[-2:] != self.shape[1:]:
+        part_of = self._part_of[numbers]
+        for k in np.unique(part_of).tolist():
+            place, inside = self.parts[k], np.flatnonzero(part_of == k)
+            wanted = self._own[numbers[inside]]
+            with opened(place.path) as file:
+                stored = dataset_in(place.path, file, place.name)
+                if stored.dtype.kind not in "biuf" or stored.shape[-2:] != self.shape[1:]:
                     got = f"{stored.dtype} {stored.shape}"
-                    raise Refused(f"{part.place}: expected frames {self.shape[1:]}, got {got}")
+                    raise Refused(f"{place}: expected frames {self.shape[1:]}, got {got}")
                 if stored.ndim == 2:
-                    check_chunks(part.place.path, stored)
-                    out[:] = stored[()]
+                    check_chunks(place.path, stored)
+                    out[inside] = stored[()]
                     continue
-                self._check(part.place, stored, wanted)
+                self._check(place, stored, wanted)
                 breaks = np.flatnonzero(np.diff(wanted) != 1) + 1
                 for run, target in zip(
                     np.split(wanted, breaks), np.split(inside, breaks), strict=True
                 ):
-                    out[target[0] : target[-1] + 1] = stored[run[0] : run[-1] + 1]
+                    out[target] = stored[run[0] : run[-1] + 1]
         return out
 
     def _check(self, place: Place, stored: h5py.Dataset, numbers: np.ndarray) -> None:
@@ -148,6 +147,25 @@ class Frames:
             if (place, index) not in self._sound:
                 check_chunks(place.path, stored, index)
                 self._sound.add((place, index))
+
+
+def _whole_frames(space: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Numbers of the frames [n v u], or of the one [v u], that a selection of HDF5 consists of;
+    none if it is not regular, or if parts of frames are selected.
+    """
+    count = shape[0] if len(shape) == 3 else 1
+    if space.get_select_type() == SELECTS_ALL:
+        return np.arange(count)
+    if not space.is_regular_hyperslab():
+        return np.arange(0)
+    numbers = np.arange(1)
+    if len(shape) == 3:
+        start, step, blocks, block = (of_axis[0] for of_axis in space.get_regular_hyperslab())
+        if blocks * block > count:  # also without limits
+            return np.arange(0)
+        numbers = (start + step * np.arange(blocks)[:, None] + np.arange(block)).ravel()
+    whole = space.get_select_npoints() == len(numbers) * math.prod(shape[-2:])
+    return numbers if whole and numbers[-1] < count else np.arange(0)
 
 
 class FrameViews(ProjectionStack):

@@ -4,7 +4,7 @@
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from mvrecon.data.linked import (
     groups,
     listing,
     texts_at,
-    unknown_attributes,
+    unknown_around,
     values_at,
 )
 from mvrecon.data.projections import exposures, nexus_axes, nexus_detector
@@ -37,6 +37,7 @@ from mvrecon.data.projections.nexus_detector import (
     FLAT,
     INVALID,
     VIEW,
+    first,
     limits_of,
     of_frames,
     there,
@@ -46,7 +47,7 @@ from mvrecon.data.storage import fields_in, held, opened
 
 EXPECTED = (
     "frames [m v u] beside an image_key (NXtomo), /exchange/data (Data Exchange), views of "
-    "mvrecon-simulate, or views.dataset=<name> of other frames"
+    "mvrecon-simulate, or other frames by views.dataset=<name> (of fields, by <file>:/<name>)"
 )
 FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 #: Names of a data set, or of one in another file.
@@ -56,7 +57,7 @@ AXIS = "calibrate=[offset_u] finds the axis"
 KEYS = (
     Key("image_key", "applied", "0 views, 1 flat fields, 2 dark fields; 3, invalid, left out"),
     Key("image_key_control", "applied", "in place of image_key; -1, alignment, left out"),
-    Key("data, data_white, data_dark", "applied", "frames, flat and dark fields"),
+    Key("data, views, data_white, data_dark", "applied", "frames, flat and dark fields"),
     Key("rotation_angle, theta", "applied", "of all frames or of the views; in its units"),
     Key("x_pixel_size, y_pixel_size", "applied", "of the sample, else of the detector, in units"),
     Key(
@@ -77,6 +78,7 @@ KEYS = (
         "of Data Exchange's data; the last one for sinograms",
         ("theta:y:x", "y:theta:x"),
     ),
+    Key("data@MATLAB_class", "compared", "warned of, as MATLAB reverses the order of axes"),
     Key("scale_factor, add_offset, _FillValue", "refused", "apply it", (1, 0, "nan")),
     Key("source/type", "applied", "beams of tubes are not parallel: the camera is asked for"),
     Key(
@@ -121,7 +123,12 @@ KEYS = (
         AXIS,
     ),
     Key("real_x_pixel_size, real_y_pixel_size", "ignored", "of the camera behind its optics"),
-    Key("theta_white, theta_dark, distance, energy, provenance", "ignored", "not needed"),
+    Key(
+        "theta_white, theta_dark, distance, energy, provenance, definition, web_camera_frame, "
+        "NDArrayUniqueId, NDArrayTimeStamp, NDArrayEpicsTS*",
+        "ignored",
+        "not needed",
+    ),
     Key(
         "calibration_date, angular_calibration, azimuthal_angle, trigger_*, raw_time_of_flight, "
         "description, serial_number, local_name, type, layout, input, crate, slot, diameter, "
@@ -149,12 +156,8 @@ KEYS = (
     *nexus_detector.KEYS,
     *nexus_axes.KEYS,
 )
-#: Words of fields beside the frames that a warning names, and their values that change nothing.
-FIELD_EFFECTS = {
-    **IMAGE_EFFECTS,
-    "time_of_flight|mask|bad.?pixel|shift|displace|jitter": 0,
-    "binning": 1,
-}
+#: Words of fields beside the frames by the values of these that change nothing; of others it is 0.
+FIELD_EFFECTS = {**IMAGE_EFFECTS, "binning": 1}
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Pixels by which a sample may move between views.
@@ -167,6 +170,7 @@ def hdf5_views(
     angles: str | Path | None = None,
     image_key: str | Path | None = None,
     layout: str | None = None,
+    field: str | None = None,
 ) -> ProjectionStack:
     """Open the views of an HDF5 file: those of mvrecon-simulate, of NXtomo or Data Exchange, or a
     data set by its name.
@@ -182,6 +186,8 @@ def hdf5_views(
         image_key: name of the key of each frame, in this or another file; None: the one beside the
             frames, if there.
         layout: "sinogram": frames are images of slices, with the angles as rows.
+        field: "flat" or "dark": open these frames, or all frames if the file has no such ones; they
+            need no angles.
 
     Raises:
         FileNotFoundError: nothing is there.
@@ -201,7 +207,9 @@ def hdf5_views(
             places = places._replace(angles=named(path, angles))
         if image_key is not None:
             places = places._replace(key=named(path, image_key))
-        return places.opened(path)
+        if field is not None:
+            places = places.of_field(path.parent.resolve())
+        return places.opened(path, field)
 
 
 def named(path: Path, name: str | Path) -> Place:
@@ -248,7 +256,7 @@ class _Layout(NamedTuple):
     exposures: Sequence[tuple[str, Place]] = ()
     flats: Sequence[tuple[str, Place]] = ()  # exposures of flat fields beside the frames
     moves: Sequence[Place] = ()
-    detector: Place | None = None  # of NXtomo
+    names: Sequence[Place] = ()  # of the frames: in these groups are the keys beside them
 
     @property
     def axes(self) -> tuple[str, str, str]:
@@ -260,107 +268,103 @@ class _Layout(NamedTuple):
     def of(cls, path: Path, dataset: str | None, sinogram: bool) -> "_Layout":
         """The layout of a file, by the name of the frames if given."""
         wanted = None if dataset is None else named(path, dataset)
-        only = None if wanted is None else address(wanted)
-        found, lost, names = {}, [], []
+        names = {} if wanted is None else {address(wanted): [wanted]}
         with opened(path) as file:
             keyed = {g.name: "image_key" in g.keys() for g in groups(file) if "data" in g.keys()}  # noqa: SIM118
+        exchange = "/exchange/data"
+        known, lost = set(), []
         for group in sorted(keyed, key=lambda name: -name.count("/")):  # detector first
+            own = f"{group.rstrip('/')}/data"
             try:
-                place = followed(path, f"{group}/data")
+                place = followed(path, own)
             except MissingFile as error:
-                lost += [error] if keyed[group] else []
+                lost += [error] if keyed[group] or own == exchange else []
                 continue
-            if place is None:
-                continue
-            names.append((address(place), place, Place(path, group)))
-            if keyed[group] and (key := names[-1][0]) not in found and key == (only or key):
-                found[key] = cls._tomo(path, group, place)
-        data = followed(path, "/exchange/data")
-        if data is not None and (key := address(data)) not in found and key == (only or key):
-            found[key] = cls._exchange(path, data, sinogram)
-        if wanted is not None and not found:
-            group = wanted.name.rpartition("/")[0] or "/"
-            layout = cls._tomo(wanted.path, group, wanted)._replace(angles=None)
-            if sinogram:  # what is stated of frames is not of rows
-                layout = layout._replace(sinogram=True, exposures=(), moves=(), detector=None)
-            return layout
+            if place is not None:
+                place = place._replace(links=(Place(path, own), *place.links))
+                names.setdefault(address(place), []).append(place)
+                known |= {address(place)} if keyed[group] or own == exchange else set()
+        found = {*names} & known if wanted is None else {address(wanted)}
         if len(found) != 1:
             if lost and not found:
                 raise lost[0]
-            places = ", ".join(str(layout.frames) for layout in found.values())
+            places = ", ".join(str(names[one][0]) for one in names if one in found)
             got = f"frames in {places}; choose by views.dataset=<name>"
             if not found:
                 got = f"none; it contains {listing(path)}"
             raise Refused(f"{path}: expected {EXPECTED}, got {got}")
-        layout = next(iter(found.values()))._replace(sinogram=sinogram)
-        for key, place, group in names:  # NXdata may scale what it links to, or state its axes
-            if key in found:
-                check_around(place)
+        one = found.pop()
+        layout = cls._tomo(names[one])
+        if any(place.links and place.links[0].name == exchange for place in names[one]):
+            layout = layout._exchange(path, sinogram)
+        elif one not in known:
+            layout = layout._replace(angles=None)
+        if sinogram:  # what is stated of frames is not of rows
+            layout = layout._replace(sinogram=True, exposures=(), moves=())
+        for place in names[one]:  # NXdata may scale what it links to, or state its axes
+            check_around(place)
+        for group, own in _groups(names[one]).items():
+            if texts_at([group], "signal").get(group, own) == own:
                 check_order(group, layout.axes, FRAMES)
         return layout
 
     @classmethod
-    def _tomo(cls, path: Path, group: str, frames: Place) -> "_Layout":
-        """The layout of NXtomo, by the group with the frames, and with their keys if there."""
-
-        def first(*names: str) -> Place | None:
-            parts = group.strip("/").split("/")
-            above = ["/".join(["", *parts[:k]]) for k in range(len(parts), -1, -1)]
-            for name in names:
-                for start in above:
-                    if (place := followed(path, f"{start}/{name}")) is not None:
-                        return place
-            return None
-
-        entry = group.rpartition("/instrument")[0]
-        source = first("instrument/source/type", "source/type")
+    def _tomo(cls, names: Sequence[Place]) -> "_Layout":
+        """The layout of NXtomo, by the names of the frames."""
+        beside = [*_groups(names)]
+        above = [outer for group in beside for outer in _outer(group)]
+        frames = names[0]
+        source = first(above, "instrument/source/type", "source/type")
         kind = None if source is None else texts_at([source], "").get(source)
         parallel = kind is None or PARALLEL.search(kind)
         for axis, option in (("x", "columns"), ("y", "rows")):
-            flipped = there(path, f"{group}/{axis}_flipped")
+            flipped = first(beside, f"{axis}_flipped", find=there)
             if flipped is not None and values_at(flipped).any():
                 warnings.warn(
                     f"{flipped}: the {option} of the frames are mirrored; without "
                     f"views.flip_{option}=true so is the volume",
                     stacklevel=2,
                 )
-        nexus_axes.warn_of_turned(Place(path, group))
-        shares = [f"{name}/{exposures.ATTENUATOR}" for name in _members(path, entry, "instrument")]
-        key = followed(path, f"{group}/image_key_control")
+        nexus_axes.warn_of_turned(beside)
+        instrument = first(above, "instrument", find=there)
+        shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in _members(instrument)]
         sizes = [
-            [first(f"sample/{axis}_pixel_size"), followed(path, f"{group}/{axis}_pixel_size")]
+            [first(above, f"sample/{axis}_pixel_size"), first(beside, f"{axis}_pixel_size")]
             for axis in "yx"
         ]
         pairs = [(y, x) for y, x in zip(*sizes, strict=True) if y is not None and x is not None]
         return cls(
             frames,
-            key or followed(path, f"{group}/image_key"),
-            first("sample/rotation_angle", "data/rotation_angle", "rotation_angle"),
+            first(beside, "image_key_control", "image_key"),
+            first(above, "sample/rotation_angle", "data/rotation_angle", "rotation_angle"),
             (),
             pairs,
             "parallel" if parallel else None,
             exposures=[
                 (name, place)
-                for above, names in (
-                    (group, (*exposures.DETECTOR, *DETECTOR_BEAM)),
-                    (entry, (*exposures.MONITORS, *shares, *BEAM)),
+                for where, those in (
+                    (beside, (*exposures.DETECTOR, *DETECTOR_BEAM)),
+                    (above, (*exposures.MONITORS, *shares, *BEAM)),
                 )
-                for name in names
-                if (place := there(path, f"{above}/{name}")) is not None
+                for name in those
+                if (place := first(where, name, find=there)) is not None
             ],
-            moves=[p for axis in "xyz" if (p := first(f"sample/{axis}_translation")) is not None],
-            detector=Place(path, group),
+            moves=[
+                place
+                for axis in "xyz"
+                if (place := first(above, f"sample/{axis}_translation")) is not None
+            ],
+            names=names,
         )
 
-    @classmethod
-    def _exchange(cls, path: Path, frames: Place, sinogram: bool) -> "_Layout":
-        """The layout of Data Exchange."""
+    def _exchange(self, path: Path, sinogram: bool) -> "_Layout":
+        """The layout of Data Exchange, which adds to that by the names of the frames."""
         order = "y:theta:x" if sinogram else "theta:y:x"
-        axes = texts_at([frames], "axes").get(frames)
+        axes = texts_at([self.frames], "axes").get(self.frames)
         if axes is not None and axes.replace(" ", "") != order:
             raise Refused(
-                f"{frames}: expected the axes {order}, got {shown(axes)}; views.layout=sinogram is "
-                f"for y:theta:x"
+                f"{self.frames}: expected the axes {order}, got {shown(axes)}; "
+                f"views.layout=sinogram is for y:theta:x"
             )
         places = {
             name: followed(path, f"/exchange/{name}")
@@ -369,17 +373,15 @@ class _Layout(NamedTuple):
         kept = [("flat", places["data_white"]), ("dark", places["data_dark"])]
         times = [there(path, "/measurement/instrument/detector/exposure_time"), _flat_time(path)]
         stated = [[(exposures.EXCHANGE, time)] if time is not None else [] for time in times]
-        return cls(
-            frames,
-            None,
-            places["theta"],
-            [(n, p) for n, p in kept if p is not None],
-            exposures=[] if sinogram else stated[0],
+        return self._replace(
+            angles=places["theta"] or self.angles,
+            fields=[(n, p) for n, p in kept if p is not None],
+            exposures=[*self.exposures, *stated[0]],
             flats=stated[1] or stated[0],
         )
 
-    def opened(self, scan: Path) -> FrameViews:
-        """The views, with fields and rig, of a scan's file."""
+    def opened(self, scan: Path, field: str | None = None) -> ProjectionStack:
+        """The views, with fields and rig, of a scan's file; or its frames of a field, if any."""
         folder = scan.parent.resolve()
         frames = Frames(self.frames, folder)
         check_order(self.frames, self.axes, FRAMES)
@@ -388,8 +390,14 @@ class _Layout(NamedTuple):
         monitors = [place for _, place in (*self.exposures, *self.flats)]
         units = texts_at([*lengths, *monitors], "units")
         stated = {n: of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
+        angles = [] if self.angles is None else [self.angles]
+        below = [stage for place in angles for stage in nexus_axes.translations_below(place)]
+        unknown = [
+            *self._unknown_fields(below),
+            *(name for place in angles for name in unknown_around(place)),
+        ]
         fields: dict[str, ProjectionStack] = {
-            name: FrameViews(frames, np.flatnonzero(keys == key), stated=stated)
+            name: FrameViews(frames, np.flatnonzero(keys == key), stated=stated, unknown=unknown)
             for name, key in (("flat", FLAT), ("dark", DARK))
             if (keys == key).any()
         }
@@ -400,37 +408,54 @@ class _Layout(NamedTuple):
                 n: of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
             }
             fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats)
+        if field in fields:
+            return fields[field]
+        if field is None and texts_at([self.frames], "MATLAB_class"):
+            warnings.warn(
+                f"{self.frames}: MATLAB reverses the order of axes: {FRAMES} are its arrays (u, v, "
+                f"m), or (u, m, v); permute those of another order",
+                stacklevel=2,
+            )
         views = np.flatnonzero(keys == VIEW)
         rig: dict[str, Any] = {"name": self.beam if self.angles else None, "detector": {}}
-        angles = [] if self.angles is None else [self.angles]
         if angles:
             turns = np.zeros(frames.shape[1], int) if self.sinogram else keys
             rig["angles"] = nexus_axes.degrees_of(angles[0], turns == VIEW)
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
-        below = [*nexus_axes.translations_below(self.angles)] if self.angles else []
         self._warn_of_moves(keys, pixel, below)
-        limits = limits_of(self.detector, frames, keys)
-        unknown = [
-            *self._unknown_fields(below),
-            *(n for p in angles for n in unknown_attributes(p)),
-        ]
+        limits = limits_of([] if self.sinogram else [*_groups(self.names)], frames, keys)
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
+
+    def of_field(self, folder: Path) -> "_Layout":
+        """The layout of frames that may be a field: without angles and pixels, and without what
+        stands beside them for another number of frames, such as views.
+        """
+        count = Frames(self.frames, folder).shape[0]
+
+        def fits(place: Place) -> bool:
+            with opened(place.path) as file:
+                return getattr(file[place.name], "size", 0) in (1, count)
+
+        return self._replace(
+            key=self.key if self.key and fits(self.key) else None,
+            angles=None,
+            pixel=(),
+            exposures=[one for one in self.exposures if fits(one[1])],
+            moves=(),
+        )
 
     def _unknown_fields(self, below: Sequence[Place]) -> list[str]:
         """Data sets beside the frames and beside the angles that no key knows, but those on which
         the angles depend.
         """
-        data_sets = [self.frames, *([] if self.angles is None else [self.angles])]
-        groups = {(one.path, one.name.rpartition("/")[0] or "/") for one in data_sets}
-        if self.detector:
-            groups.add(self.detector[:2])
+        names = _groups([*self.names, *([] if self.angles is None else [self.angles])])
         found: list[str] = []
-        for path, group in sorted(groups):
-            with opened(path) as file:
-                found += fields_in(file[group], FIELD_EFFECTS)
-        stages = {place.name.rpartition("/")[2] for place in below}
-        return [name for name in unknown_names(found, KEYS) if name not in stages]
+        for place in names:
+            with opened(place.path) as file:
+                found += fields_in(file[place.name], FIELD_EFFECTS)
+        known = {*names.values(), *(place.name.rpartition("/")[2] for place in below)}
+        return [name for name in unknown_names(found, KEYS) if name not in known]
 
     def _keys(self, count: int) -> np.ndarray:
         """The image_key of each of so many frames; all are views without one."""
@@ -485,13 +510,28 @@ class _Layout(NamedTuple):
         return None
 
 
-def _members(path: Path, entry: str, name: str) -> list[str]:
-    """The members of a group of an entry, as <group>/<member>; none if it is not there."""
-    if (place := there(path, f"{entry}/{name}")) is None:
+def _groups(names: Sequence[Place]) -> dict[Place, str]:
+    """The groups in which data sets are, also by the links to them, with their names there."""
+    found: dict[Place, str] = {}
+    for place in names:
+        for path, name, _ in (*place.links, place):
+            group, _, own = name.rpartition("/")
+            found.setdefault(Place(path, group or "/"), own)
+    return found
+
+
+def _outer(group: Place) -> Iterator[Place]:
+    """A group and those that it is in, up to the file's root."""
+    parts = group.name.strip("/").split("/")
+    return (Place(group.path, "/" + "/".join(parts[:k])) for k in range(len(parts), -1, -1))
+
+
+def _members(group: Place | None) -> list[str]:
+    """Names of the members of a group; none of what is no group."""
+    if group is None:
         return []
-    with opened(place.path) as file:
-        group: Any = file[place.name]
-        return [f"{name}/{inner}" for inner in group] if isinstance(group, h5py.Group) else []
+    with opened(group.path) as file:
+        return [*found] if isinstance(found := file[group.name], h5py.Group) else []
 
 
 def _flat_time(path: Path) -> Place | None:

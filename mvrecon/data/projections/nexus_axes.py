@@ -8,7 +8,7 @@ runs upwards and z along the beam.
 
 import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import h5py
 import numpy as np
@@ -18,6 +18,7 @@ from mvrecon.core.files.keys import Key
 from mvrecon.data.linked import (
     UNITS,
     Place,
+    address,
     followed,
     numbers_at,
     texts_at,
@@ -118,18 +119,22 @@ def _sense(angles: Place) -> float:
 
 
 def translations_below(angles: Place) -> Iterator[Place]:
-    """The translations on which the angles of a sample depend, by their chain of `depends_on`.
+    """The translations on which the angles of a sample depend, or the sample itself, by their
+    chains of `depends_on`.
 
     Args:
         angles: place of the angles of all frames, or of the views.
 
     Warns:
-        UserWarning: the chain leads to nothing in the file.
+        UserWarning: a chain leads to nothing in the file.
 
     Raises:
-        Refused: the axis itself is turned, or the chain does not end.
+        Refused: another rotation, or a chain that does not end.
     """
-    for place in _chain(angles, texts_at([angles], "depends_on").get(angles, ".")):
+    own = address(angles)
+    sample = Place(angles.path, angles.name.rpartition("/")[0] or "/")
+    stages = [*_chain(angles, texts_at([angles], "depends_on").get(angles, ".")), *_stages(sample)]
+    for place in dict.fromkeys(stage for stage in stages if address(stage) != own):
         kind = texts_at([place], "transformation_type").get(place, "translation")
         if kind.strip().lower() != "rotation":
             yield place
@@ -138,6 +143,12 @@ def translations_below(angles: Place) -> Iterator[Place]:
                 f"{angles}: expected an axis that no other rotation turns, got {place} of up to "
                 f"{np.abs(turned).max():g}"
             )
+
+
+def _stages(group: Place) -> Iterator[Place]:
+    """The transformations on which a detector or a sample depends, by its own `depends_on`."""
+    if (start := followed(group.path, f"{group.name}/depends_on")) is not None:
+        yield from _chain(start, texts_at([start], "").get(start, "."))
 
 
 def _chain(place: Place, name: str) -> Iterator[Place]:
@@ -163,17 +174,20 @@ def _chain(place: Place, name: str) -> Iterator[Place]:
     raise Refused(f"{start}: expected at most {MAX_CHAIN} transformations by depends_on, got more")
 
 
-def warn_of_turned(detector: Place) -> None:
+def warn_of_turned(groups: Sequence[Place]) -> None:
     """Warn of a detector that its transformations turn, as those of mirrored frames do: those in
     its group `transformations`, and of the chain of its `depends_on`.
+
+    Args:
+        groups: groups in which the frames are, such as that of the detector.
     """
-    places = []
-    if (chain := followed(detector.path, f"{detector.name}/transformations")) is not None:
-        with opened(chain.path) as file:
-            names = list(group) if isinstance(group := file[chain.name], h5py.Group) else []
-        places += [followed(chain.path, f"{chain.name}/{name}") for name in names]
-    if (first := followed(detector.path, f"{detector.name}/depends_on")) is not None:
-        places += _chain(first, texts_at([first], "").get(first, "."))
+    places: list[Place | None] = []
+    for detector in groups:
+        if (chain := followed(detector.path, f"{detector.name}/transformations")) is not None:
+            with opened(chain.path) as file:
+                names = list(group) if isinstance(group := file[chain.name], h5py.Group) else []
+            places += [followed(chain.path, f"{chain.name}/{name}") for name in names]
+        places += _stages(detector)
     for place in dict.fromkeys(place for place in places if place is not None):
         name, kind = place.name.rpartition("/")[2], texts_at([place], "transformation_type")
         kind = kind.get(place, "").strip().lower()

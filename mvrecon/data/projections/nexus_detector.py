@@ -5,6 +5,7 @@ and greatest grey value (Könnecke and others, J. Appl. Cryst. 48, 2015).
 import math
 import re
 import warnings
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,19 @@ def there(path: Path, name: str) -> Place | None:
         return followed(path, name)
     except MissingFile:
         return None
+
+
+def first(
+    groups: Sequence[Place],
+    *names: str,
+    find: Callable[[Path, str], Place | None] = followed,
+) -> Place | None:
+    """The first data set of any of these names in groups, the names in their order."""
+    for name in names:
+        for path, group, _ in groups:
+            if (place := find(path, f"{group}/{name}")) is not None:
+                return place
+    return None
 
 
 def of_frames(name: str, place: Place, keys: np.ndarray, unit: str) -> np.ndarray:
@@ -110,25 +124,23 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
 
 
 def limits_of(
-    detector: Place | None, frames: Frames, keys: np.ndarray
+    groups: Sequence[Place], frames: Frames, keys: np.ndarray
 ) -> tuple[np.ndarray | None, float | None]:
     """Pixels that the detector's mask marks as bad, and its greatest grey value; None of what
     it does not state. Compares the order of the frames.
 
     Args:
-        detector: group of the detector; None of a file without one.
+        groups: groups in which the frames are, such as that of the detector.
         frames: all frames of the file.
         keys: image_key of each frame.
 
     Warns:
         UserWarning: a mask of another size, other values than one number, an underload.
     """
-    if detector is None:
-        return None, None
     places = {
         name: place
         for name in ("pixel_mask", "sequence_number", *NUMBERS)
-        if (place := there(detector.path, f"{detector.name}/{name}")) is not None
+        if (place := first(groups, name, find=there)) is not None
     }
     if (place := places.get("sequence_number")) is not None:
         _check_sequence(place, keys)

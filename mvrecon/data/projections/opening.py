@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,9 +19,8 @@ from mvrecon.data.dicom_image import dicom_file, same
 from mvrecon.data.linked import Place, followed, listing, values_at
 from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
-from mvrecon.data.projections.frames import Frames, FrameViews
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, in_field, view_files
-from mvrecon.data.projections.nexus import IN_FILE, in_another
+from mvrecon.data.projections.nexus import IN_FILE, hdf5_views, in_another
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.data.storage import opened
@@ -46,6 +45,7 @@ def open_projections(
     gaps: bool = False,
     fields: Sequence[Field] = (),
     layout: Layout | None = None,
+    field: str | None = None,
     **names: str | Path | None,
 ) -> ProjectionStack:
     """Open projections, read view by view in their stored values and order.
@@ -62,6 +62,7 @@ def open_projections(
         gaps: allow numbers in unequal steps in a folder.
         fields: dark and flat fields, whose files in the folder are not views.
         layout: "sinogram": images of slices with the angles as rows.
+        field: "flat" or "dark": open these frames of an HDF5 file, or all if it has no such ones.
         names: names of data sets in the file; see `hdf5_views`.
 
     Warns:
@@ -75,7 +76,7 @@ def open_projections(
             names, missing numbers, truth values, other endings, damage.
     """
     given = {option: name for option, name in names.items() if name is not None}
-    stack = _opened(Path(path).expanduser(), pattern, gaps, fields, layout, given)
+    stack = _opened(Path(path).expanduser(), pattern, gaps, fields, layout, field, given)
     if stack.dtype.kind == "b":  # of masks alone
         raise Refused(f"{path}: expected pixels that are integers or floats, got {stack.dtype}")
     return Sinograms(stack) if layout == "sinogram" else stack
@@ -87,6 +88,7 @@ def _opened(
     gaps: bool,
     fields: Sequence[Field],
     layout: Layout | None,
+    field: str | None,
     names: dict[str, str | Path],
 ) -> ProjectionStack:
     """The images as they are stored."""
@@ -110,7 +112,8 @@ def _opened(
     if pattern is not None:
         raise Refused(f"{path}: expected a folder for the pattern {pattern!r}, got a file")
     if reader is not None:
-        options = {"layout": layout} if VIEW_FILES.takes(reader, "layout") else {}
+        options = {"layout": layout, "field": field}
+        options = {o: v for o, v in options.items() if VIEW_FILES.takes(reader, o)}
         return VIEW_FILES.build(reader, path, **names, **options)
     if path.suffix.lower() in ENDINGS or dicom_file(path):
         return ImageFiles([path])
@@ -127,7 +130,7 @@ def _expected() -> str:
 def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
     """Bad pixels of a file of the views' size; raises Refused for others."""
     path = Path(path).expanduser()
-    stack = _opened(path, None, False, (), None, {})
+    stack = _opened(path, None, False, (), None, None, {})
     if stack.n_views > 1:
         raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
     return read_mask(path, shape, stack.read(0, 1)[0].numpy())
@@ -180,6 +183,7 @@ def mean_field(
     value: Field,
     layout: Layout | None,
     exposure: str | Path | None = None,
+    used: Collection[str] = (),
 ) -> Float[Tensor, "v u"]:
     """A field in grey values: a number, the mean of images, or the folder's own.
 
@@ -190,6 +194,7 @@ def mean_field(
         value: the option of this name.
         layout: layout of the views.
         exposure: the option `exposure`.
+        used: names of data sets that options use.
 
     Warns:
         UserWarning: images of a flat field that differ, or a field of another exposure or beam than
@@ -224,7 +229,7 @@ def mean_field(
                 f"{stack.path}: expected a {name} field with the {key} {own} of the views, got "
                 f"{other}; pixels must be those of the views"
             )
-    unknown = sorted({*stack.unknown} - {*views.unknown})
+    unknown = sorted({*stack.unknown} - {*views.unknown, *used})
     if len({units.casefold() for units in (stack.units, views.units) if units}) > 1:
         unknown.append(f"{name}@units={stack.units}")
     warn_of_unknown(stack.path, unknown)
@@ -310,18 +315,20 @@ def _field_at(
 ) -> ProjectionStack | float:
     """A field by its name in the scan's HDF5 file, or by its own path."""
     folder = Path(value).expanduser().is_dir()
-    if views.scan and not folder and (place := _place_in(views, value)):
-        frames = Frames(place, views.scan.parent.resolve())
-        stack: ProjectionStack | float = FrameViews(frames, np.arange(frames.shape[0]))
+    if views.scan and not folder and _place_in(views, value):
+        stack: ProjectionStack | float = hdf5_views(views.scan, value, field=name)
     else:
         try:
             path = Path(value).expanduser()
-            other = ImageFiles(in_field(path, name)) if folder else open_projections(path)
+            other = (
+                ImageFiles(in_field(path, name)) if folder else open_projections(path, field=name)
+            )
         except FileNotFoundError as error:
             raise FileNotFoundError(f"{error}{_absent(views, f'data set {value}')}") from error
+        own = path.resolve() == views.path.resolve() and other.names == views.names
         if name in other.fields:  # of a scan
             stack = other.fields[name]
-        elif path.resolve() == views.path.resolve() or _files(views) & _files(other):
+        elif own or _files(views) & _files(other):
             raise Refused(f"{value}: expected images of the {name} field, got those of the views")
         else:
             stack = other

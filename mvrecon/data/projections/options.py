@@ -126,3 +126,10 @@ class Measured:
             )
         if self.saturation is not None and not self.saturation > 0:
             raise ValueError(f"Expected a positive saturation, got {self.saturation}")
+
+    @property
+    def used(self) -> set[str]:
+        """Names, without their groups, of the data sets that options may name in an HDF5 file."""
+        fields = (self.dark, self.flat, self.exposure, self.bad_pixels)
+        given = (self.dataset, self.angles, self.image_key, *fields)
+        return {str(name).rpartition("/")[2] for name in given}

@@ -136,9 +136,7 @@ class MeasuredViews:
                 f"without flat fields"
             )
         other = kind in PLAIN_UNITS and not PLAIN_UNITS[kind].fullmatch(stack.units)
-        given = (*names.values(), *own, options.exposure, options.bad_pixels)
-        used = {str(name).rpartition("/")[2] for name in given}  # data sets of the scan's file
-        unknown = [name for name in stack.unknown if name not in used]
+        unknown = [name for name in stack.unknown if name not in options.used]
         warn_of_unknown(stack.path, [*unknown, *[f"units={stack.units}"] * other])
         if kind == "counts" and options.linearise is not None:
             raise Refused(
@@ -175,9 +173,9 @@ class MeasuredViews:
     def fields(self) -> Fields:
         """Dark field and contrast of the kept pixels in grey values."""
         where = Path(self.options.path).expanduser()
-        layout, exposure = self.options.layout, self.options.exposure
+        layout, exposure, used = (getattr(self.options, n) for n in ("layout", "exposure", "used"))
         dark, flat = (
-            self._kept(mean_field(self.stack, where, name, value, layout, exposure))
+            self._kept(mean_field(self.stack, where, name, value, layout, exposure, used))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
         return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)

@@ -538,6 +538,60 @@ def test_virtual_frames_have_the_part_of_the_detector_of_their_files(tmp_path):
         opened(path)
 
 
+VALUES, EVERY = frames(), slice(None)
+HEAD, TAIL = slice(len(KEYS) // 2), slice(len(KEYS) // 2, None)
+TWICE = np.stack([VALUES, VALUES + 1], 1).reshape(-1, ROWS, COLUMNS)
+#: Parts of virtual frames: of each its frames, the values of its data set, and the frames of these.
+PARTS = {
+    "the last first": [(TAIL, VALUES[TAIL], EVERY), (HEAD, VALUES[HEAD], EVERY)],
+    "of two writers in turn": [(slice(k, None, 2), VALUES[k::2], EVERY) for k in (1, 0)],
+    "each second frame": [(EVERY, TWICE, slice(None, None, 2))],
+    "an image each": [(k, VALUES[k], EVERY) for k in range(len(KEYS))],
+    "another order of bytes": [(EVERY, VALUES.astype(">u2"), EVERY)],
+}
+NO_PARTS = {
+    "some twice": [
+        (HEAD, VALUES[HEAD], EVERY),
+        (slice(1, 11), VALUES[TAIL], EVERY),
+    ],
+    "some of none": [(HEAD, VALUES[HEAD], EVERY)],
+    "rows": [
+        ((EVERY, slice(3)), VALUES[:, :3], EVERY),
+        ((EVERY, slice(3, 6)), VALUES[:, 3:], EVERY),
+    ],
+    "a type that holds more": [(EVERY, VALUES.astype("u4") + 2**16, EVERY)],
+}
+
+
+def virtual_of(path, parts):
+    """An NXtomo file whose frames are virtual, of such parts."""
+    layout = h5py.VirtualLayout(VALUES.shape, VALUES.dtype)
+    with h5py.File(path.parent / "parts.h5", "w") as file:
+        for k, (target, values, own) in enumerate(parts):
+            file[f"part{k}"] = values
+            source = h5py.VirtualSource("parts.h5", f"part{k}", values.shape, values.dtype)
+            layout[target] = source[own]
+    tomo(path)
+    with h5py.File(path, "a") as file:
+        del file["entry/instrument/detector/data"]
+        file.create_virtual_dataset("entry/instrument/detector/data", layout)
+    return path
+
+
+@pytest.mark.parametrize("form", PARTS)
+def test_virtual_frames_are_those_that_hdf5_reads(form, tmp_path):
+    """Whatever the order of their parts, and the steps in which these are taken."""
+    views = opened(virtual_of(tmp_path / "a.nxs", PARTS[form])).whole().views
+    assert np.allclose(views, integrals(), atol=1e-6)
+
+
+@pytest.mark.parametrize("form", NO_PARTS)
+def test_virtual_frames_that_are_not_each_one_whole_frame_are_refused(form, tmp_path):
+    """Tried beside these: parts without limits, and columns of frames."""
+    with pytest.raises(Refused, match="virtual frames|each of .* frames once"):
+        opened(virtual_of(tmp_path / "a.nxs", NO_PARTS[form]))
+
+
 @pytest.mark.parametrize("name", ["/", "entry", "entry/sample", "entry/instrument/detector/data"])
 def test_the_kind_of_a_scale_of_a_plot_is_no_scale(name, tmp_path):
     """As nxtomo writes it for silx. Neutral numbers of each axis change nothing; others do."""
@@ -866,6 +920,111 @@ def test_frames_of_two_names_are_those_of_the_detector(link, tmp_path):
         views = opened(path, **options)
         assert views.n_views == VIEWS
         assert views.stack.rig["detector"] == {"pixel_mm": (2e-3, 3e-3)}
+
+
+DETECTORS = {
+    "a mask": ("instrument/detector/pixel_mask", np.eye(ROWS, COLUMNS, dtype=int), "dead, hot"),
+    "mirrored columns": ("instrument/detector/x_flipped", True, "views.flip_columns=true"),
+    "times": ("instrument/detector/count_time", np.where(KEYS == 1, 2.0, 1.0), "count_time 2,"),
+    "a monitor": ("control/data", np.linspace(1, 0.8, len(KEYS)), "has the control/data"),
+    "a key": ("instrument/detector/skew", 2.0, "does not know: skew"),
+}
+
+
+@pytest.mark.parametrize("dataset", [None, "entry/plot/data"])
+@pytest.mark.parametrize("case", DETECTORS)
+def test_what_stands_beside_another_name_of_the_frames_counts(case, dataset, tmp_path):
+    """Frames with their key in a group of NXdata, of which the detector has the pixels' size."""
+    name, value, message = DETECTORS[case]
+    path = tomo(tmp_path / "a.nxs", **{name.replace("/", "__"): value})
+    with h5py.File(path, "a") as file:
+        detector = file["entry/instrument/detector"]
+        file["entry/plot/data"] = detector["data"]
+        file["entry/plot/image_key"] = detector["image_key_control"]
+        del detector["image_key"], detector["image_key_control"]
+    with pytest.warns(UserWarning, match=message):
+        found = opened(path, dataset=dataset, find_bad_pixels=False)
+        views = found.whole()
+    assert found.stack.rig["detector"]["pixel_mm"] == pytest.approx((2e-3, 3e-3))
+    expected = torch.from_numpy(integrals()).float()
+    assert torch.allclose(views.views[views.mask], expected[views.mask], atol=2e-6)
+
+
+@pytest.mark.parametrize("kind", ["rotation", "translation", "still"])
+def test_a_sample_that_depends_on_stages_above_its_axis(kind, tmp_path):
+    """NeXus states the uppermost stage by the sample's own `depends_on`."""
+    stage = np.zeros(len(KEYS)) if kind == "still" else np.arange(len(KEYS)) * 1.0
+    first = {"sample__depends_on": "/entry/sample/transformations/stage"}
+    path = tomo(tmp_path / "a.nxs", **first, sample__transformations__stage=stage)
+    below = {"depends_on": "/entry/sample/rotation_angle"}
+    below["transformation_type"] = "translation" if kind == "translation" else "rotation"
+    stated(path, entry__sample__transformations__stage=below)
+    if kind == "rotation":
+        with pytest.raises(Refused, match="no other rotation turns, got .*stage of up to"):
+            opened(path)
+    elif kind == "translation":
+        with pytest.warns(UserWarning, match="stage: the sample moved by"):
+            opened(path)
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            opened(path)
+
+
+@pytest.mark.parametrize("signal", ["raw", "preview"])
+def test_the_order_of_axes_that_nxdata_states_of_frames_by_name(signal, tmp_path):
+    """Its `axes` are those of its signal."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["plot/raw"] = grey()
+        file["plot"].attrs.update(signal=signal, axes=["theta", "x", "y"])
+    options = {"dataset": "plot/raw", "flat": 6e4}
+    if signal == "raw":
+        with pytest.raises(Refused, match="the axis 'x' at the place 1"):
+            opened(tmp_path / "a.h5", **options)
+    else:
+        assert opened(tmp_path / "a.h5", **options).n_views == VIEWS
+
+
+FLATS = {
+    "keys of flat fields": {"keys": [1, 1, 1]},
+    "keys of both fields": {"keys": [1, 2, 1]},
+    "keys of views": {"keys": [0, 0, 0]},
+    "no keys": {"keys": None},
+    "the time of the views": {"keys": [1, 1, 1], "time": 1.0},
+    "another time": {"keys": [1, 1, 1], "time": 2.0},
+}
+
+
+@pytest.mark.parametrize("inside", [True, False])
+@pytest.mark.parametrize("case", FLATS)
+def test_flat_fields_in_a_group_or_file_of_their_own(case, inside, tmp_path):
+    """They need no angles, and what stands beside them is of them. Tried beside these: the same for
+    dark fields, and frames of NXtomo whose angles are all alike.
+    """
+    keys, time = (FLATS[case].get(name) for name in ("keys", "time"))
+    with (
+        h5py.File(tmp_path / "a.h5", "w") as scan,
+        h5py.File(tmp_path / "flat.nxs", "w") as other,
+    ):
+        scan["views/raw"], scan["views/count_time"] = grey(), 1.0
+        own = (scan if inside else other).create_group("flats")
+        own["data"] = np.where([[[key == 2]] for key in keys or [1] * 3], DARK, [[[FLAT]]]).astype(
+            "u2"
+        ) * np.ones((1, ROWS, COLUMNS), "u2")
+        own["sample/rotation_angle"] = np.zeros(3)
+        if keys:
+            own["image_key"] = keys
+        if time:
+            own["count_time"] = time
+    flat = "flats/data" if inside else tmp_path / ("flat.nxs" if keys else "flat.nxs:/flats/data")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        options = {"dataset": "views/raw", "flat": str(flat), "dark": DARK}
+        found = opened(tmp_path / "a.h5", **options, find_bad_pixels=False).whole().views
+    assert np.allclose(found, integrals(), atol=1e-6)
+    assert ["count_time 2, its views have 1" in str(one.message) for one in caught] == [True] * (
+        time == 2
+    )
 
 
 @pytest.mark.parametrize("many", [1, 4])

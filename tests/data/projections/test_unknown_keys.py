@@ -290,7 +290,7 @@ ATTRIBUTES = {
                 "flip": False,
                 "mirrored": 0,
                 "DISPLAY_ORIGIN": "UL",
-                "MATLAB_class": "uint16",
+                "MATLAB_empty": 1,
                 "coordinates": "a b",
             },
         },
@@ -322,6 +322,27 @@ def test_attributes_of_frames_that_no_reader_knows_are_named(case, tmp_path):
             continue
         with pytest.raises(Refused, match=f"(?i){expected}"):
             opened(path, **options)
+
+
+def test_attributes_of_groups_that_no_reader_knows_are_named(tmp_path):
+    """Of all groups that contain the frames, the angles or the fields, each once, as programs
+    without NeXus describe a scan; not those of NeXus. Tried beside these: a direction of the
+    angles, a mean grey value, and a pixel size.
+    """
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["scan/raw"], file["air/flat"] = grey(), np.full((2, *grey().shape[1:]), 60_000)
+        file["turns/angles"] = np.linspace(0, 180, len(grey()))
+        file.attrs.update(creator="me", file_time="2020", HDF5_Version="1.14", log_applied=True)
+        file["scan"].attrs.update(NX_class="NXentry", default="data", polarity="inverted", dose=0)
+        file["air"].attrs.update(averaged=16)
+        file["turns"].attrs.update(direction="clockwise")
+        file.create_group("notes").attrs.update(weather="fair")
+    found = {"dataset": "scan/raw", "angles": "turns/angles"}
+    expected = ["/@log_applied", "scan@polarity", "turns@direction"]
+    assert sorted(named(tmp_path / "a.h5", **found, **GIVEN)) == expected
+    with pytest.warns(UserWarning) as caught:
+        opened(tmp_path / "a.h5", **found, flat="air/flat", find_bad_pixels=False)
+    assert "know: air@averaged; if" in str(caught[1].message)
 
 
 def test_attributes_that_are_zero_are_not_named(tmp_path):
@@ -385,8 +406,13 @@ FIELDS = {
     ),
     "images and tables": (
         {"mask": np.ones((2, 2)), "sample_shifts": np.ones((9, 2)), "preview": np.ones((2, 2))},
-        ["mask", "sample_shifts"],
+        ["mask", "preview", "sample_shifts"],
     ),
+    "rows and columns of MATLAB": (
+        {"monitor": np.ones((1, 9)), "gain": [[1.0]], "magnification": [[4.0]]},
+        ["magnification", "monitor"],
+    ),
+    "of each view": ({"shake": np.ones((9, 3)), "poses": np.ones((9, 3, 4))}, ["poses", "shake"]),
     "another axis": ({"time_of_flight": np.arange(9.0)}, ["time_of_flight"]),
     "names without such a word": (
         {"is_fft_shifted": True, "binning_x": 2, "magnification": 4.0, "rotation": 90, "skew": 0},
@@ -414,6 +440,30 @@ def test_other_names_of_a_scan_in_hdf5_are_named(tmp_path):
         file["raw"].attrs["inverted"] = True
     options = {"dataset": "raw", "layout": "sinogram", **GIVEN}
     assert named(tmp_path / "b.h5", **options) == ["raw@inverted"]
+
+
+def test_keys_beside_a_link_to_frames_are_named(tmp_path):
+    """As those beside the frames, and links among them, also to what is not there."""
+    with h5py.File(tmp_path / "raw.h5", "w") as file:
+        file["entry/data"], file["entry/skew"] = grey(), 2.0
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["scan/raw"] = h5py.ExternalLink("raw.h5", "/entry/data")
+        file["scan/turned"], file["stage/height"] = True, 4.0
+        file["scan/height"], file["scan/lost"] = (h5py.SoftLink(f"/stage/{n}") for n in "ab")
+        file["scan/type"] = np.dtype("f4")
+    found = named(tmp_path / "a.h5", dataset="scan/raw", **GIVEN)
+    assert sorted(found) == ["height", "lost", "skew", "turned"]
+
+
+def test_frames_of_matlab_are_warned_of(tmp_path):
+    """MATLAB writes its axes in reverse order: (v, u, m) become [m u v], and (u, v, m) [m v u]."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["raw"], file["air"] = grey(), np.full((2, *grey().shape[1:]), 60_000)
+        for name in file:
+            file[name].attrs["MATLAB_class"] = np.bytes_("uint16")
+    with pytest.warns(UserWarning, match="raw: MATLAB reverses the order of axes") as caught:
+        opened(tmp_path / "a.h5", dataset="raw", flat="air", find_bad_pixels=False)
+    assert len(caught) == 1
 
 
 @pytest.mark.parametrize("angle", [0.0, 180.0])

@@ -120,9 +120,7 @@ def test_fields_of_another_pixel_size_are_refused(tmp_path):
         image.SetSpacing((spacing, spacing, 1.0))
         sitk.WriteImage(image, str(tmp_path / f"{name}.mha"))
     opened(tmp_path / "scan.mha", dark=DARK, flat=str(tmp_path / "same.mha"))
-    with pytest.raises(
-        Refused, match="with the pixel sizes and Offset .* of the views"
-    ):
+    with pytest.raises(Refused, match="with the pixel sizes and Offset .* of the views"):
         opened(tmp_path / "scan.mha", dark=DARK, flat=str(tmp_path / "binned.mha"))
 
 
