@@ -57,10 +57,7 @@ CAMERAS = Registry(
     matrices="mvrecon.geometry.cameras.formats.matrices:read",
 )
 PROJECTORS = Registry(
-    "projector",
-    2,
-    drr="mvrecon.operators.drr:Drr",
-    radon="mvrecon.operators.radon:Radon",
+    "projector", 2, drr="mvrecon.operators.drr:Drr", radon="mvrecon.operators.radon:Radon"
 )
 HEADS = Registry(
     "head",
@@ -68,11 +65,7 @@ HEADS = Registry(
     density="mvrecon.methods.learned.heads:Density",
 )
 WEIGHTINGS = Registry("weighting", 1, unet="mvrecon.methods.learned.weightings:UNetWeighting")
-NETWORKS = Registry(
-    "network",
-    2,
-    unet="mvrecon.methods.learned.baselines:UNet3d",
-)
+NETWORKS = Registry("network", 2, unet="mvrecon.methods.learned.baselines:UNet3d")
 #: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
 #: return a volume; see `methods/method.py`.
 METHODS = Registry(
@@ -161,16 +154,7 @@ METRICS = Registry(
 )
 
 REGISTRIES = {
-    r.kind: r
-    for r in (
-        SCENES,
-        CAMERAS,
-        PROJECTORS,
-        HEADS,
-        WEIGHTINGS,
-        NETWORKS,
-        METHODS,
-    )
+    r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, WEIGHTINGS, NETWORKS, METHODS)
 }
 #: Registries of `mvrecon-list`: parts that a config names by `name`, further parts of training, and
 #: readers of views.

@@ -32,10 +32,7 @@ class Blur(Symmetric):
     """
 
     def __init__(
-        self,
-        shape: Sequence[int],
-        sigmas: Sequence[float],
-        device: torch.device | str = "cpu",
+        self, shape: Sequence[int], sigmas: Sequence[float], device: torch.device | str = "cpu"
     ):
         super().__init__(shape, device)
         self._bands = [

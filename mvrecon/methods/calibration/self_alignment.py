@@ -32,12 +32,7 @@ from mvrecon.methods.calibration.alignment import (
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
 from mvrecon.methods.classical.solver import check_no_gradient
-from mvrecon.methods.classical.truncation import (
-    CUT_EDGE,
-    MAX_AIR,
-    MAX_AIR_SHARE,
-    truncated_slices,
-)
+from mvrecon.methods.classical.truncation import CUT_EDGE, MAX_AIR, MAX_AIR_SHARE, truncated_slices
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.checks import check_finite, check_views
@@ -253,11 +248,7 @@ class Agreement(NamedTuple):
     gain: Float[Tensor, "b m"]
 
 
-def agreement(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    weights: SirtWeights,
-) -> Agreement:
+def agreement(A: Projector, views: Float[Tensor, "b 1 m v u"], weights: SirtWeights) -> Agreement:
     """Compare each view with what the others predict.
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
@@ -365,10 +356,7 @@ def _among(A: Projector, kept: Float[Tensor, "b 1 m v u"], weights: SirtWeights)
 
 
 def _predicted(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    keep: Bool[Tensor, "b m"],
-    weights: SirtWeights,
+    A: Projector, views: Float[Tensor, "b 1 m v u"], keep: Bool[Tensor, "b m"], weights: SirtWeights
 ) -> Float[Tensor, "b 1 m v u"]:
     """Each view as the kept ones of the other folds predict it."""
     fold = torch.arange(views.shape[2], device=views.device) % FOLDS
@@ -439,10 +427,7 @@ class Aligned(nn.Module):
     """
 
     def __init__(
-        self,
-        method: MethodPart,
-        alternations: PositiveInt = 4,
-        iterations: PositiveInt = 8,
+        self, method: MethodPart, alternations: PositiveInt = 4, iterations: PositiveInt = 8
     ):
         super().__init__()
         self.method = build_method(method)

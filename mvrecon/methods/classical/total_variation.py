@@ -239,10 +239,7 @@ class PenalisedFit(NamedTuple):
     support: Float[Tensor, "d h w"] | None
 
     def gap(
-        self,
-        volume: Float[Tensor, "b c d h w"],
-        residual: Float[Tensor, "b c m v u"],
-        bound: Bound,
+        self, volume: Float[Tensor, "b c d h w"], residual: Float[Tensor, "b c m v u"], bound: Bound
     ) -> Float[Tensor, "b c"]:
         """Return an upper bound of the objective's excess over its minimum, relative to the
         objective.
