@@ -235,20 +235,9 @@ def warn_unless_aligned(by: Alignment) -> None:
         )
 
 
-class Agreement(NamedTuple):
-    """The agreement of each view with the others.
-
-    Args:
-        lost: views that the others do not predict: empty, overexposed, or noise.
-        gain: gain of each view relative to the others', 1 unless it makes the views more
-            consistent.
-    """
-
-    lost: Bool[Tensor, "b m"]
-    gain: Float[Tensor, "b m"]
-
-
-def agreement(A: Projector, views: Float[Tensor, "b 1 m v u"], weights: SirtWeights) -> Agreement:
+def agreement(
+    A: Projector, views: Float[Tensor, "b 1 m v u"], weights: SirtWeights
+) -> tuple[Bool[Tensor, "b m"], Float[Tensor, "b m"]]:
     """Compare each view with what the others predict.
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
@@ -261,6 +250,10 @@ def agreement(A: Projector, views: Float[Tensor, "b 1 m v u"], weights: SirtWeig
         A: the operator of the nominal cameras.
         views: measured views.
         weights: weights as `sirt_weights` returns them.
+
+    Returns:
+        The views that the others do not predict: empty, overexposed, or noise; and the gain of each
+        view relative to the others', 1 unless it makes the views more consistent.
     """
     blank = ~views.flatten(3).any(dim=3)[:, 0]
     smooth = blurred(views, BLUR_SIGMA_PX)
@@ -302,10 +295,10 @@ def agreement(A: Projector, views: Float[Tensor, "b 1 m v u"], weights: SirtWeig
         usual = norm.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
         lost = unlike | (blank & (norm > MAX_EMPTY_NORM * usual))
     if not views.is_cuda and not lost.any():
-        return Agreement(lost, gain)
+        return lost, gain
     many = 2 * lost.sum(dim=1) > lost.shape[1]
     better = _predict_better_without(A, views / gain[:, None, :, None, None], lost, weights)
-    return Agreement(lost & (many | better)[:, None], gain)
+    return lost & (many | better)[:, None], gain
 
 
 def _predict_better_without(
