@@ -206,7 +206,8 @@ def describe(kind: str, name: str) -> Part:
     for point in installed():
         if point.name == f"{kind}.{name}" and point.dist is not None:
             origin += f" ({point.dist.name} {point.dist.version})"
-    return Part(kind, name, origin, _summary(owner), options, catch_all, is_class)
+    summary = " ".join(inspect.cleandoc(owner.__doc__ or "").partition("\n\n")[0].split())
+    return Part(kind, name, origin, summary, options, catch_all, is_class)
 
 
 def required(kind: str, name: str) -> list[str]:
@@ -221,7 +222,3 @@ def describe_section(name: str, type: Any) -> Part:
     options, _ = options_of_section(section)
     summary = f"The options of `{name}.` in a configuration."
     return Part("setting", name, section.owners[0], summary, options)
-
-
-def _summary(owner: Any) -> str:
-    return " ".join((inspect.cleandoc(owner.__doc__ or "")).partition("\n\n")[0].split())
