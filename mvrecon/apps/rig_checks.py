@@ -57,7 +57,7 @@ MAX_STEP_DEVIATION, MIN_ARC_CHANGE = 0.02, 0.05
 #: (root mean square), and by up to 2 r / pi in their mean.
 MAX_LEFT_BY_ANGLES = (0.5 / (0.5 - 4 / math.pi**2)) ** 0.5
 #: Size of the grid for views that end inside the object, relative to theirs.
-EXTENSION = 1.5
+EXTENDED_GRID_FACTOR = 1.5
 #: What is asked of views that fit better in another orientation than in the stored one.
 CURES = {
     "columns reversed": "does the rig turn the other way (camera.clockwise, or the other sign of "
@@ -213,7 +213,8 @@ class SomeViews(NamedTuple):
         y, seen = torch.cat(views), torch.cat(shares)
         cut = edge_shares(torch.cat(edges, dim=2))[0] > CUT_EDGE
         if cut[0].any() or cut[1].all():
-            grid = grid.resized([n if n == 1 else math.ceil(n * EXTENSION) for n in grid.size])
+            sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
+            grid = grid.resized(sizes)
         y = blurred(y[None, None], BLUR_PX, seen > 0) * seen
         # pixels that a blurred one is the mean of, along an axis
         several = [2 * math.sqrt(math.pi) * BLUR_PX for size in seen.shape[1:] if size > 1]
