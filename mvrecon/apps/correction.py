@@ -34,11 +34,7 @@ from mvrecon.methods.calibration.from_data import (
     unknowns,
 )
 from mvrecon.methods.calibration.hardening import Linearisation, fit_linearisation
-from mvrecon.methods.calibration.self_alignment import (
-    MAX_BESIDE,
-    share_beside,
-    warn_unless_aligned,
-)
+from mvrecon.methods.calibration.self_alignment import MAX_BESIDE, share_beside, warn_unless_aligned
 from mvrecon.methods.classical.truncation import cut_sides
 from mvrecon.methods.method import Alignment
 from mvrecon.operators.operator import LinearOperator

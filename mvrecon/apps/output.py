@@ -21,15 +21,7 @@ from mvrecon.geometry.grid import Grid
 #: Bytes of a voxel in the volume's file, at most.
 BYTES_PER_VOXEL = 4
 #: What a run writes into its folder beside the volume.
-PRODUCTS = (
-    SETTINGS,
-    VERSIONS,
-    "rig.json",
-    "rig.png",
-    "planes.png",
-    "cameras.png",
-    RESULTS,
-)
+PRODUCTS = (SETTINGS, VERSIONS, "rig.json", "rig.png", "planes.png", "cameras.png", RESULTS)
 #: Ends the names of files beside the volume: a calibrated rig, the scan with it, and the error's
 #: standard deviation.
 RIG_ENDING, SCAN_ENDING, SIGMA_ENDING = ".cameras.json", f".{scan_file.NAME}", ".sigma.nii.gz"

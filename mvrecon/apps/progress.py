@@ -23,18 +23,16 @@ class Bar:
     def __init__(self) -> None:
         console = Console(stderr=True)
         shown = logger.getEffectiveLevel() == logging.INFO and console.is_terminal
-        texts = (
+        self._bars = progress.Progress(
             progress.TextColumn("{task.description}"),
             progress.BarColumn(24),
             progress.MofNCompleteColumn(),
-        )
-        times = (
             progress.TextColumn("{task.fields[residual]}"),
             progress.TimeElapsedColumn(),
             progress.TimeRemainingColumn(),
-        )
-        self._bars = progress.Progress(
-            *texts, *times, console=console, transient=True, disable=not shown
+            console=console,
+            transient=True,
+            disable=not shown,
         )
         self._task = self._bars.add_task("preparing", total=None, residual="")
         self._begin = time.perf_counter()

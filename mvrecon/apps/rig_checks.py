@@ -212,6 +212,9 @@ class SomeViews(NamedTuple):
             noise.append(SIGMA_PER_MEDIAN * noise_of(part.views).abs().median().item())
         y, seen = torch.cat(views), torch.cat(shares)
         cut = edge_shares(torch.cat(edges, dim=2))[0] > CUT_EDGE
+        if cut[0].any() or cut[1].all():
+            sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
+            grid = grid.resized(sizes)
         y = blurred(y[None, None], BLUR_PX, seen > 0) * seen
         # pixels that a blurred one is the mean of, along an axis
         several = [2 * math.sqrt(math.pi) * BLUR_PX for size in seen.shape[1:] if size > 1]
@@ -223,7 +226,7 @@ class SomeViews(NamedTuple):
             first,
             region,
             region.seen_by(scan.cameras[numbers]),
-            _extended(grid) if cut[0].any() or cut[1].all() else grid,
+            grid,
             cut,
             y.to(device),
             seen.to(device),
@@ -304,12 +307,6 @@ def _region(scan: Scan, grid: Grid) -> Region:
     joined = (min(size, rows), min(size, columns))
     kept = (0, rows - rows % joined[0]), (0, columns - columns % joined[1])
     return Region((rows, columns), kept[0], kept[1], joined)
-
-
-def _extended(grid: Grid) -> Grid:
-    """The grid with more voxels of the same size along its sides."""
-    sizes = [n if n == 1 else math.ceil(n * EXTENDED_GRID_FACTOR) for n in grid.size]
-    return grid.resized(sizes)
 
 
 def _oriented(seen: SomeViews) -> list[Rig]:

@@ -311,14 +311,10 @@ def _streamed(scan: Scan, method: Method, _: str, bar: Bar) -> _Run:
     solver: Any = method.module
     volume = solver.solve.streamed(read, scan.cameras, scan.grid, **solver.options)[0, 0]
     scan.measured.warn_of_values(odd)
-    compared = _compared(len(scan.cameras))
+    count = len(scan.cameras)
+    compared = range(0, count, math.ceil(count / COMPARED_VIEWS))
     outcome = Outcome(volume, compared_views=len(compared), lost=lost)
     return outcome, lambda: _residual(scan, volume, compared)
-
-
-def _compared(count: int) -> range:
-    """Views at equal steps, at most `COMPARED_VIEWS`."""
-    return range(0, count, math.ceil(count / COMPARED_VIEWS))
 
 
 def _residual(scan: Scan, volume: Float[Tensor, "d h w"], numbers: range) -> float:

@@ -184,11 +184,6 @@ class GridOfScan:
                 f"{self.spacing}"
             )
 
-    @property
-    def is_open(self) -> bool:
-        """Whether no option chooses the grid."""
-        return self.size is self.like is self.seen_by is None
-
     def voxels(self, cameras: Cameras) -> Grid:
         """The grid for a rig."""
         if self.like is not None:
@@ -202,7 +197,8 @@ class GridOfScan:
 
 def grid_of(options: GridOfScan, method: nn.Module) -> Callable[[Cameras], Grid]:
     """f(cameras) -> the grid that a method reconstructs with these options."""
-    if isinstance(method, TrainedMethod) and options.is_open:
+    undecided = options.size is options.like is options.seen_by is None
+    if isinstance(method, TrainedMethod) and undecided:
         trained = method.loaded().module.projector.grid
         return lambda _: trained
     return options.voxels
@@ -266,7 +262,11 @@ def open_scan(
     if measured.stack.attenuated and projector.get("mu") is None:
         _warn_of_missing_mu(measured)
     if scatter is not None:
-        scan = replace(scan, scatter=_scatter(scan, scatter))
+        SCATTER.check(scatter)
+        counts = _counts(scan, "scatter")
+        whole = counts.whole().views[None, None]
+        expected = SCATTER.from_config(scatter, whole, partial(_read, counts), cameras)
+        scan = replace(scan, scatter=expected)
     absolute = None
     if factors is not None:
         FACTORS.check(factors)
@@ -292,14 +292,6 @@ def _warn_of_missing_mu(views: MeasuredViews) -> None:
         f"counts, got no projector.mu; without it the activity is too low",
         stacklevel=3,
     )
-
-
-def _scatter(scan: Scan, scatter: ScatterPart) -> Float[Tensor, "1 1 m v u"]:
-    """The scatter that is expected in a scan's views, in counts."""
-    SCATTER.check(scatter)
-    views = _counts(scan, "scatter")
-    counts = views.whole().views[None, None]
-    return SCATTER.from_config(scatter, counts, partial(_read, views), scan.cameras)
 
 
 def _read(

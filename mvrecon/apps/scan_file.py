@@ -21,14 +21,7 @@ import yaml
 from mvrecon.apps.config.grammar import as_text
 from mvrecon.apps.settings import ReconstructSettings
 from mvrecon.core.files.atomic import write_text
-from mvrecon.core.files.checks import (
-    MAX_YAML_BYTES,
-    Refused,
-    file_in,
-    from_home,
-    text_of,
-    yaml_of,
-)
+from mvrecon.core.files.checks import MAX_YAML_BYTES, Refused, file_in, from_home, text_of, yaml_of
 from mvrecon.core.options import with_paths
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.core.quantities import FILE_MARK, INSIDE_MARK

@@ -35,8 +35,7 @@ from mvrecon.training.settings import (
 
 ViewsOptions: TypeAlias = Annotated[Options, OptionsOf("mvrecon.data.projections.options:Measured")]
 AlignOptions: TypeAlias = Annotated[
-    Options,
-    OptionsOf("mvrecon.methods.calibration.self_alignment:self_aligned", passed=2),
+    Options, OptionsOf("mvrecon.methods.calibration.self_alignment:self_aligned", passed=2)
 ]
 #: Sections of settings that are no parts, for `mvrecon-list setting`.
 SECTIONS: dict[str, Any] = {

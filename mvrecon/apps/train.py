@@ -25,10 +25,7 @@ RESUMED_SETTING = "trainer.max_steps"
 
 
 def train(
-    settings: TrainSettings,
-    folder: Path,
-    overrides: Sequence[str] = (),
-    steps: int | None = None,
+    settings: TrainSettings, folder: Path, overrides: Sequence[str] = (), steps: int | None = None
 ) -> Results:
     """Train every method of `settings` in a run folder, or resume its training; returns the
     results.

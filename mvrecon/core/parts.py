@@ -57,10 +57,7 @@ CAMERAS = Registry(
     matrices="mvrecon.geometry.cameras.formats.matrices:read",
 )
 PROJECTORS = Registry(
-    "projector",
-    2,
-    drr="mvrecon.operators.drr:Drr",
-    radon="mvrecon.operators.radon:Radon",
+    "projector", 2, drr="mvrecon.operators.drr:Drr", radon="mvrecon.operators.radon:Radon"
 )
 HEADS = Registry(
     "head",
@@ -68,11 +65,7 @@ HEADS = Registry(
     density="mvrecon.methods.learned.heads:Density",
 )
 WEIGHTINGS = Registry("weighting", 1, unet="mvrecon.methods.learned.weightings:UNetWeighting")
-NETWORKS = Registry(
-    "network",
-    2,
-    unet="mvrecon.methods.learned.baselines:UNet3d",
-)
+NETWORKS = Registry("network", 2, unet="mvrecon.methods.learned.baselines:UNet3d")
 #: Methods `method(views, A) -> Reconstruction`: modules, and functions f(A, views, **options) that
 #: return a volume; see `methods/method.py`.
 METHODS = Registry(
@@ -161,16 +154,7 @@ METRICS = Registry(
 )
 
 REGISTRIES = {
-    r.kind: r
-    for r in (
-        SCENES,
-        CAMERAS,
-        PROJECTORS,
-        HEADS,
-        WEIGHTINGS,
-        NETWORKS,
-        METHODS,
-    )
+    r.kind: r for r in (SCENES, CAMERAS, PROJECTORS, HEADS, WEIGHTINGS, NETWORKS, METHODS)
 }
 #: Registries of `mvrecon-list`: parts that a config names by `name`, further parts of training, and
 #: readers of views.
@@ -222,7 +206,8 @@ def describe(kind: str, name: str) -> Part:
     for point in installed():
         if point.name == f"{kind}.{name}" and point.dist is not None:
             origin += f" ({point.dist.name} {point.dist.version})"
-    return Part(kind, name, origin, _summary(owner), options, catch_all, is_class)
+    summary = " ".join(inspect.cleandoc(owner.__doc__ or "").partition("\n\n")[0].split())
+    return Part(kind, name, origin, summary, options, catch_all, is_class)
 
 
 def required(kind: str, name: str) -> list[str]:
@@ -237,7 +222,3 @@ def describe_section(name: str, type: Any) -> Part:
     options, _ = options_of_section(section)
     summary = f"The options of `{name}.` in a configuration."
     return Part("setting", name, section.owners[0], summary, options)
-
-
-def _summary(owner: Any) -> str:
-    return " ".join((inspect.cleandoc(owner.__doc__ or "")).partition("\n\n")[0].split())

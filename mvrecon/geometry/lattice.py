@@ -250,10 +250,8 @@ def enclosed(
     """
     planes, j, _ = _planes(maps, shape)
     half = maps.new_tensor(source[::-1])[:, None, None] / 2 * (1 + FACE_TOLERANCE)
-    top, under = (
-        planes[..., NUMERATORS, :, :],
-        planes[..., [ACROSS_DENOMINATOR, ACROSS_DENOMINATOR, DEPTH_DENOMINATOR], :, :] * half,
-    )
+    top = planes[..., NUMERATORS, :, :]
+    under = planes[..., [ACROSS_DENOMINATOR, ACROSS_DENOMINATOR, DEPTH_DENOMINATOR], :, :] * half
     low = high = maps.new_tensor(0.0)
     low, high = low - torch.inf, high + torch.inf
     for face in torch.cat([under - top, under + top], dim=-3).unbind(dim=-3):  # positive within

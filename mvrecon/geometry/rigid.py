@@ -30,9 +30,8 @@ def euler_rotation(
     if len(axes) != 3 or not set(axes) <= set("xyz"):
         raise ValueError(f"Euler axes must be three letters of 'xyz', such as 'zyz', got {axes!r}")
     unit = torch.eye(3, dtype=torch.float64)[["xyz".index(a) for a in axes]]
-    first, second, third = axis_angle_to_rotation_matrix(
-        torch.deg2rad(angles)[..., None] * unit
-    ).unbind(-3)
+    turns = axis_angle_to_rotation_matrix(torch.deg2rad(angles)[..., None] * unit)
+    first, second, third = turns.unbind(-3)
     return first @ second @ third
 
 

@@ -148,9 +148,7 @@ def deepinv_physics(A: LinearOperator) -> Any:
         from deepinv.physics import LinearPhysics
 
     return LinearPhysics(
-        A=lambda x, **_: A(x),
-        A_adjoint=lambda y, **_: A.T(y),
-        img_size=(1, *A.domain_shape),
+        A=lambda x, **_: A(x), A_adjoint=lambda y, **_: A.T(y), img_size=(1, *A.domain_shape)
     )
 
 

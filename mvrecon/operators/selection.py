@@ -245,11 +245,7 @@ class Skipped:
 def skip_report(code: Tensor | None, skip: str, shape: Sequence[int]) -> Skipped:
     """Report a call from its occupancy code; None: nothing was skipped."""
     if code is None:
-        return Skipped(
-            "off",
-            Box.whole(shape),
-            "skipping is off, or the back end does not skip",
-        )
+        return Skipped("off", Box.whole(shape), "skipping is off, or the back end does not skip")
     occupancy = Occupancy.decoded(code)
     whole = occupancy.box == Box.whole(shape)
     mode = "brick" if occupancy.bricks is not None else "off" if whole else "box"

@@ -92,11 +92,7 @@ def backproject_images(
     chosen = choose_backend(values, backend, "voxel_driven", voxels.self_test)
     act = voxels.backproject_reference if chosen == "reference" else voxels.backproject
     volumes = act(
-        values.flatten(0, 1),
-        images.maps,
-        list(images.ray_extent),
-        weighted,
-        list(images.shape),
+        values.flatten(0, 1), images.maps, list(images.ray_extent), weighted, list(images.shape)
     )
     return volumes.unflatten(0, views.shape[:2])
 

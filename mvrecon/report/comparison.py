@@ -21,10 +21,8 @@ from mvrecon.core.files.runs import EVALUATION, RESULTS, SETTINGS, Results, flat
 #: Figures of merit to compare.
 COMPARED_FIGURES = ("psnr", "ssim", "nrmse", "view_nrmse")
 #: Settings to ignore, and the maximum number of settings in a run's name.
-IGNORED_SETTINGS, MAX_NAMED_SETTINGS = (
-    ("name", "label", "resume", "plugins", "checkpoint", "save"),
-    4,
-)
+IGNORED_SETTINGS = ("name", "label", "resume", "plugins", "checkpoint", "save")
+MAX_NAMED_SETTINGS = 4
 #: Settings that determine the test scenes.
 SCENE_SETTINGS = ("scene", "test_scene", "data", "checkpoint")
 #: Relative difference of a case's truth between machines, at most.

@@ -27,12 +27,7 @@ from torch import distributed
 
 from mvrecon.core.machine import silence_libraries, world
 from mvrecon.core.parts import LOGGERS, METRICS, Options
-from mvrecon.core.quantities import (
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
-)
+from mvrecon.core.quantities import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 from mvrecon.core.registry import import_plugins
 from mvrecon.data.dataset import Batch, single_cases
 from mvrecon.data.module import SceneData

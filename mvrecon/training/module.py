@@ -220,9 +220,8 @@ class ReconstructionModule(L.LightningModule):
         else exactly the checkpoint's; and the gradients of an interrupted accumulation.
         """
         schedule: Any = self.lr_schedulers()
-        for group, highest, factor in zip(
-            schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas, strict=True
-        ):
+        by_group = schedule.optimizer.param_groups, schedule.base_lrs, schedule.lr_lambdas
+        for group, highest, factor in zip(*by_group, strict=True):
             group["lr"] = highest * factor(schedule.last_epoch)
         gradients, self._gradients = self._gradients, {}
         for name, weight in self.named_parameters():

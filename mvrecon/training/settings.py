@@ -36,8 +36,7 @@ CallbackPart: TypeAlias = Annotated[
     Options, PartOf("callback", targets="mvrecon.training.targets:allowed")
 ]
 LoggerPart: TypeAlias = Annotated[
-    Options,
-    PartOf("logger", targets="mvrecon.training.targets:allowed", supplied=("save_dir",)),
+    Options, PartOf("logger", targets="mvrecon.training.targets:allowed", supplied=("save_dir",))
 ]
 #: A setting that must be given, as OmegaConf writes it.
 MISSING: Any = "???"

@@ -186,9 +186,7 @@ def _writers(trainer: L.Trainer) -> list[Any]:
 
 
 #: Settings without effect on results, or replaced by `method`.
-IGNORED_SETTINGS = (
-    *("name", "resume", "plugins", "callbacks", "logger", "compare", "method", "label"),
-)
+IGNORED_SETTINGS = "name resume plugins callbacks logger compare method label".split()
 #: Figures of the table by their names in the results; costs, and theirs.
 TABLE_FIGURES = ("psnr", "ssim", "view_nrmse")
 TABLE_COSTS = {"ms": "ms_per_volume", "peak_mb": "peak_mb", "train_seconds": "train_seconds"}

@@ -44,12 +44,7 @@ from mvrecon.apps.settings import RECORDS
 from mvrecon.core.files.checks import file_in, from_home
 from mvrecon.core.files.runs import of_weights
 from mvrecon.core.machine import silence_libraries
-from mvrecon.core.options import (
-    check,
-    has_entries,
-    is_section,
-    with_paths,
-)
+from mvrecon.core.options import check, has_entries, is_section, with_paths
 from mvrecon.core.parts import REGISTRIES
 from mvrecon.core.quantities import FILE_MARK, INSIDE_MARK, WEIGHTS_MARK
 from mvrecon.core.registry import check_options, hint, import_plugins, locate

@@ -88,7 +88,7 @@ def _store(path: Path) -> None:
     ConfigStore.instance().store(path.stem, node, group, where, provider=str(path))
 
 
-def check_foreign(values: Any, path: Path, whole: bool = True) -> None:
+def check_foreign(values: Any, path: Path, whole: bool) -> None:
     """Check the plain values of a file from elsewhere.
 
     Args:

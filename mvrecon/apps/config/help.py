@@ -39,12 +39,7 @@ def help_text(app: str, record: type | None = None) -> str:
     meanings = dict(re.findall(r"^  - ([\w@]+): \S+ +# (.*)", body, re.MULTILINE))
     known, taken = choices_by_group(), groups_of(app)
     chosen = [
-        _entry(
-            key,
-            default,
-            meanings.get(key, PART),
-            f"Choices: {', '.join(known[group])}",
-        )
+        _entry(key, default, meanings.get(key, PART), f"Choices: {', '.join(known[group])}")
         for key, default in taken.items()
         if (group := key.partition("@")[0]) in known
     ]

@@ -110,12 +110,9 @@ def from_matrix(
         )
     frame = torch.linalg.inv(left)
     source = -(frame @ P[:, :, 3:])[..., 0]
-    unscaled = 1 / left[:, 2].norm(
-        dim=-1
-    )  # the frame's own distance: the last row of its inverse is n / distance
-    return _from_frame(
-        source, frame * _distances(distance, P) / unscaled[:, None, None], shape, extent
-    )
+    # the frame's own distance: the last row of its inverse is n / distance
+    unscaled = 1 / left[:, 2].norm(dim=-1)[:, None, None]
+    return _from_frame(source, frame * _distances(distance, P) / unscaled, shape, extent)
 
 
 def to_astra(cameras: Cameras) -> Float[Tensor, "m 12"]:

@@ -99,15 +99,10 @@ def _pooled(volume: Float[Tensor, "d h w"], seen: Tensor) -> Float[Tensor, "d h 
     return adaptive_avg_pool3d(volume[None].cpu().double().clamp(min=0), (d, h, w))[0]
 
 
-def _block_shape(grid: Grid, views: int) -> tuple[int, int, int]:
-    most = min(MAX_BLOCKS, max(MIN_BLOCKS, int((MAX_TESTS / views) ** (1 / 3))))
-    d, h, w = (min(most, n) for n in grid.shape)
-    return d, h, w
-
-
 def _seen(cameras: Cameras, grid: Grid) -> Float[Tensor, "d h w"]:
     """The share of the views that see the centre of each block."""
-    shape, rig = _block_shape(grid, len(cameras)), cameras.to("cpu")
+    most = min(MAX_BLOCKS, max(MIN_BLOCKS, int((MAX_TESTS / len(cameras)) ** (1 / 3))))
+    shape, rig = [min(most, n) for n in grid.shape], cameras.to("cpu")
     flat = voxel_centres(grid.divided(shape[::-1])).reshape(-1, 3)
     counts = torch.zeros(len(flat), dtype=torch.float64)
     for view in rig:

@@ -299,9 +299,8 @@ def _cut(
     cut with the box.
     """
     half = torch.tensor(grid.shape[::-1], dtype=torch.float64) / 2 + margin
-    world = centred_affine(grid) @ torch.diag(
-        torch.cat([half, half.new_ones(1)])
-    )  # of points in the cube -1 .. 1
+    cube_to_box = torch.diag(torch.cat([half, half.new_ones(1)]))
+    world = centred_affine(grid) @ cube_to_box  # of points in the cube -1 .. 1
     frame = replace(cameras, parallel=False).matrix @ world.to(cameras.source)
     cube = torch.cat([torch.eye(3), -torch.eye(3)]).to(frame)
     cube = torch.cat([cube, cube.new_ones(6, 1)], dim=1).expand(len(frame), 6, 4)

@@ -107,13 +107,8 @@ def _cameras(record: Any) -> Cameras:
 
 def _vector(row: Any, name: str, m: int) -> list[float]:
     vector = row.get(name) if isinstance(row, dict) else None
-    if (
-        isinstance(vector, list)
-        and len(vector) == 3
-        and all(type(x) in (int, float) for x in vector)
-    ):
-        if all(
-            abs(x) <= sys.float_info.max for x in vector
-        ):  # false for nan, inf, and integers past them
+    if isinstance(vector, list) and len(vector) == 3:
+        # false for nan, inf, and integers past them
+        if all(type(x) in (int, float) and abs(x) <= sys.float_info.max for x in vector):
             return vector
     raise ValueError(f"expected {name!r} of camera {m} as three finite mm, got {shown(vector)}")

@@ -165,23 +165,18 @@ def random_rig(
 def _scattered(
     rng: torch.Generator, count: int, distance: float, ratio: float, detector: Detector
 ) -> Cameras:
-    """Cameras at random azimuths, elevations and distances, all aimed at the origin."""
-    outwards = _directions(rng, count)
+    """Cameras at random distances in random directions, uniform over the zone of the sphere between
+    the elevations, all aimed at the origin.
+    """
+    azimuth, share = torch.rand(2, count, generator=rng, dtype=torch.float64)
+    highest = torch.tensor(MAX_ELEVATION_DEGREES, dtype=torch.float64)
+    height = (2 * share - 1) * torch.deg2rad(highest).sin()
+    across, azimuth = (1 - height**2).sqrt(), 2 * torch.pi * azimuth
+    outwards = torch.stack([across * azimuth.cos(), across * azimuth.sin(), height], dim=-1)
     off = torch.rand(count, 1, generator=rng, dtype=torch.float64)
     source = distance * (1 + MAX_DISTANCE_DEVIATION * (2 * off - 1)) * outwards
     R = look_at(source, torch.zeros_like(source))
     return detector.carried(source, (1 - ratio) * source, R)
-
-
-def _directions(rng: torch.Generator, count: int) -> Float[Tensor, "m 3"]:
-    """Unit vectors, uniform over the zone of the sphere between the elevations."""
-    azimuth, share = torch.rand(2, count, generator=rng, dtype=torch.float64)
-    height = (2 * share - 1) * torch.deg2rad(
-        torch.tensor(MAX_ELEVATION_DEGREES, dtype=torch.float64)
-    ).sin()
-    across = (1 - height**2).sqrt()
-    azimuth = 2 * torch.pi * azimuth
-    return torch.stack([across * azimuth.cos(), across * azimuth.sin(), height], dim=-1)
 
 
 def _whole(rng: torch.Generator, pair: Sequence[int]) -> int:

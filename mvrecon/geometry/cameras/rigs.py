@@ -409,9 +409,9 @@ def sinogram_rig(grid: Grid, angles: int, bins: int | None = None) -> Cameras:
     rig = parallel(angles, detector, 2 * width * diagonal, arc_degrees=360.0, start_degrees=90.0)
     rows, columns = rig.shape
     turned = (columns - 1) * rig.u + (rows - 1) * rig.v  # rows upwards, in the order of slices
-    return Cameras(
-        rig.source + turned, rig.origin + turned, -rig.u, -rig.v, rig.shape, parallel=True
-    ).moved(axes, grid.centre)
+    source, origin = rig.source + turned, rig.origin + turned
+    rig = Cameras(source, origin, -rig.u, -rig.v, rig.shape, parallel=True)
+    return rig.moved(axes, grid.centre)
 
 
 #: Of DC-SPECT: rows and columns of modules, and a detector's edge.

@@ -32,10 +32,7 @@ class Blur(Symmetric):
     """
 
     def __init__(
-        self,
-        shape: Sequence[int],
-        sigmas: Sequence[float],
-        device: torch.device | str = "cpu",
+        self, shape: Sequence[int], sigmas: Sequence[float], device: torch.device | str = "cpu"
     ):
         super().__init__(shape, device)
         self._bands = [
@@ -219,9 +216,8 @@ class _ViewFit(NamedTuple):
         for _ in range(REWEIGHTED_FITS):
             left = (rest - (self.columns @ change[..., None])[..., 0]).detach()
             scale = self._scale(left)
-            weight = self.weight * (
-                HUBER_THRESHOLD * scale / left.abs().clamp_min(MIN_RESIDUAL)
-            ).clamp_max(1)
+            share = HUBER_THRESHOLD * scale / left.abs().clamp_min(MIN_RESIDUAL)
+            weight = self.weight * share.clamp_max(1)
             weighted = self.columns * (weight / (self.correlated * scale**2))[..., None]
             # the prior keeps it regular, so no check has to synchronise
             inverse = torch.linalg.inv_ex(weighted.mT @ self.columns + self.precision.diag())[0]

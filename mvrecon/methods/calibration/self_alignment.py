@@ -32,12 +32,7 @@ from mvrecon.methods.calibration.alignment import (
 from mvrecon.methods.calibration.from_data import motions
 from mvrecon.methods.classical.sirt import SirtWeights, inverse_sums, sirt, sirt_weights
 from mvrecon.methods.classical.solver import check_no_gradient
-from mvrecon.methods.classical.truncation import (
-    CUT_EDGE,
-    MAX_AIR,
-    MAX_AIR_SHARE,
-    truncated_slices,
-)
+from mvrecon.methods.classical.truncation import CUT_EDGE, MAX_AIR, MAX_AIR_SHARE, truncated_slices
 from mvrecon.methods.learned.start import CaseCache
 from mvrecon.methods.method import Alignment, Reconstruction, build_method
 from mvrecon.operators.checks import check_finite, check_views
@@ -240,24 +235,9 @@ def warn_unless_aligned(by: Alignment) -> None:
         )
 
 
-class Agreement(NamedTuple):
-    """The agreement of each view with the others.
-
-    Args:
-        lost: views that the others do not predict: empty, overexposed, or noise.
-        gain: gain of each view relative to the others', 1 unless it makes the views more
-            consistent.
-    """
-
-    lost: Bool[Tensor, "b m"]
-    gain: Float[Tensor, "b m"]
-
-
 def agreement(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    weights: SirtWeights,
-) -> Agreement:
+    A: Projector, views: Float[Tensor, "b 1 m v u"], weights: SirtWeights
+) -> tuple[Bool[Tensor, "b m"], Float[Tensor, "b m"]]:
     """Compare each view with what the others predict.
 
     Each view is compared with its prediction from the other folds' views up to a gain and a shift
@@ -270,6 +250,10 @@ def agreement(
         A: the operator of the nominal cameras.
         views: measured views.
         weights: weights as `sirt_weights` returns them.
+
+    Returns:
+        The views that the others do not predict: empty, overexposed, or noise; and the gain of each
+        view relative to the others', 1 unless it makes the views more consistent.
     """
     blank = ~views.flatten(3).any(dim=3)[:, 0]
     smooth = blurred(views, BLUR_SIGMA_PX)
@@ -311,10 +295,10 @@ def agreement(
         usual = norm.masked_fill(blank, torch.nan).nanmedian(dim=1, keepdim=True).values
         lost = unlike | (blank & (norm > MAX_EMPTY_NORM * usual))
     if not views.is_cuda and not lost.any():
-        return Agreement(lost, gain)
+        return lost, gain
     many = 2 * lost.sum(dim=1) > lost.shape[1]
     better = _predict_better_without(A, views / gain[:, None, :, None, None], lost, weights)
-    return Agreement(lost & (many | better)[:, None], gain)
+    return lost & (many | better)[:, None], gain
 
 
 def _predict_better_without(
@@ -365,10 +349,7 @@ def _among(A: Projector, kept: Float[Tensor, "b 1 m v u"], weights: SirtWeights)
 
 
 def _predicted(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    keep: Bool[Tensor, "b m"],
-    weights: SirtWeights,
+    A: Projector, views: Float[Tensor, "b 1 m v u"], keep: Bool[Tensor, "b m"], weights: SirtWeights
 ) -> Float[Tensor, "b 1 m v u"]:
     """Each view as the kept ones of the other folds predict it."""
     fold = torch.arange(views.shape[2], device=views.device) % FOLDS
@@ -439,10 +420,7 @@ class Aligned(nn.Module):
     """
 
     def __init__(
-        self,
-        method: MethodPart,
-        alternations: PositiveInt = 4,
-        iterations: PositiveInt = 8,
+        self, method: MethodPart, alternations: PositiveInt = 4, iterations: PositiveInt = 8
     ):
         super().__init__()
         self.method = build_method(method)

@@ -54,14 +54,11 @@ class PoissonLikelihood:
         skip_zero_bins: bool = True,
     ):
         check_measured(counts, "counts [b c m v u]", A.range_shape, A.device)
-        self.A, self.views = (
-            A,
-            ViewSelection(A.range_shape, range(len(counts[0, 0])) if views is None else views),
-        )
-        measured, added = (
-            to_accumulation_dtype(self.views(counts)),
-            self.views(spread_background(background, counts)),
-        )
+        self.A = A
+        chosen = range(len(counts[0, 0])) if views is None else views
+        self.views = ViewSelection(A.range_shape, chosen)
+        measured = to_accumulation_dtype(self.views(counts))
+        added = self.views(spread_background(background, counts))
         bins = {"counts": measured, "background": added}
         faults = [(~(x >= 0) | ~x.isfinite()).sum() for x in bins.values()]
         full = (measured != 0).flatten(0, 1).any(dim=0)[None, None]

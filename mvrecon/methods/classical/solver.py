@@ -1,9 +1,9 @@
 """Common parts of iterative methods: a method yields its iterates, and `solve` consumes them."""
 
-import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import wraps
+from inspect import signature
 from itertools import islice
 from numbers import Integral
 from typing import Literal, NamedTuple, ParamSpec, Self, TypedDict
@@ -91,10 +91,7 @@ def declares(
     """
 
     def declared(method: Callable[P, Tensor]) -> Callable[P, Tensor]:
-        name, parameters = (
-            getattr(method, "__name__", "method"),
-            inspect.signature(method).parameters,
-        )
+        name, parameters = getattr(method, "__name__", "method"), signature(method).parameters
         known = set(parameters) - {"common"}
         if "common" in parameters:
             known |= set(Common.__annotations__)

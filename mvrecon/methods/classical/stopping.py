@@ -240,16 +240,16 @@ def held_out(
     check_finite(views)
     left = list(range(min(every // 2, count - 1), count, every))
     kept, held_out = without(A, views, left)
-    validation, trials = _Validation(*held_out, patience), []
+    trials, picks = [], []
     for weight in [None] if weights is None else weights:
         run = partial(method, *kept, **_with(fixed, weight))
-        trials.append(ValidationRun(weight, validation.errors(run, fixed.get("monitor"))))
-    picks = []
+        errors = _errors(run, *held_out, patience, fixed.get("monitor"))
+        trials.append(ValidationRun(weight, errors))
     for sample in range(len(views)):
         best = min(trials, key=lambda trial: min(trial.errors[sample]))  # noqa: B023
         errors = best.errors[sample]
-        picks.append(_Pick(1 + errors.index(min(errors)), best.weight))
-    most = max(pick.iterations for pick in picks)
+        picks.append((1 + errors.index(min(errors)), best.weight))
+    most = max(iterations for iterations, _ in picks)
     if most == fixed.get("iterations"):
         warnings.warn(
             f"All {most} iterations that were allowed are the best of {method.__name__}; more may "
@@ -257,53 +257,51 @@ def held_out(
             stacklevel=2,
         )
     volume = _chosen(method, A, views, picks, fixed)
-    chosen = None if weights is None else [pick.weight for pick in picks if pick.weight is not None]
-    return Choice(volume, [pick.iterations for pick in picks], chosen, trials)
+    chosen = None if weights is None else [weight for _, weight in picks if weight is not None]
+    return Choice(volume, [iterations for iterations, _ in picks], chosen, trials)
 
 
-class _Pick(NamedTuple):
-    """The choice of one sample."""
+def _errors(
+    run: Callable[..., Tensor],
+    A: LinearOperator,
+    views: Tensor,
+    patience: int,
+    monitor: Monitor | None,
+) -> list[list[float]]:
+    """The relative error of held-out views after every iteration of a run, for each sample; the run
+    stops after so many iterations without improvement.
+    """
+    errors: list[list[float]] = [[] for _ in views]
+    size = views.flatten(1).norm(dim=1).clamp_min(torch.finfo(torch.float32).tiny)
 
-    iterations: int
-    weight: float | None
+    def stalled(curve: list[float]) -> bool:
+        return bool(curve) and len(curve) - 1 - curve.index(min(curve)) >= patience
 
+    def record(iterate: Iterate) -> bool:
+        misfit = (views - A(iterate.volume)).flatten(1).norm(dim=1) / size
+        for curve, error in zip(errors, misfit.tolist(), strict=True):
+            if not stalled(curve):
+                curve.append(error)
+        return all(map(stalled, errors))
 
-class _Validation(NamedTuple):
-    """Held-out views, and the number of iterations without improvement after which a run stops."""
-
-    A: LinearOperator
-    views: Tensor
-    patience: int
-
-    def errors(self, run: Callable[..., Tensor], monitor: Monitor | None) -> list[list[float]]:
-        """Return their relative error after every iteration of a run, for each sample."""
-        errors: list[list[float]] = [[] for _ in self.views]
-        size = self.views.flatten(1).norm(dim=1).clamp_min(torch.finfo(torch.float32).tiny)
-
-        def record(iterate: Iterate) -> bool:
-            misfit = (self.views - self.A(iterate.volume)).flatten(1).norm(dim=1) / size
-            for curve, error in zip(errors, misfit.tolist(), strict=True):
-                if not self._stalled(curve):
-                    curve.append(error)
-            return all(map(self._stalled, errors))
-
-        run(monitor=record if monitor is None else combined(record, monitor))
-        if not all(errors):
-            raise ValueError("Expected a method that iterates, got one that ended before it began")
-        return errors
-
-    def _stalled(self, errors: list[float]) -> bool:
-        return len(errors) - 1 - errors.index(min(errors)) >= self.patience if errors else False
+    run(monitor=record if monitor is None else combined(record, monitor))
+    if not all(errors):
+        raise ValueError("Expected a method that iterates, got one that ended before it began")
+    return errors
 
 
 def _chosen(
-    method: Method, A: LinearOperator, views: Tensor, picks: list[_Pick], options: dict[str, Any]
+    method: Method,
+    A: LinearOperator,
+    views: Tensor,
+    picks: list[tuple[int, float | None]],
+    options: dict[str, Any],
 ) -> Float[Tensor, "b c d h w"]:
-    """Reconstruct all samples, those of equal choice in one run."""
+    """Reconstruct all samples by their iterations and weights, those of equal choice in one run."""
     parts: dict[int, Tensor] = {}
-    for pick in dict.fromkeys(picks):
-        samples = [sample for sample, choice in enumerate(picks) if choice == pick]
-        chosen: dict[str, Any] = {**_with(options, pick.weight), "iterations": pick.iterations}
+    for iterations, weight in dict.fromkeys(picks):
+        samples = [sample for sample, pick in enumerate(picks) if pick == (iterations, weight)]
+        chosen: dict[str, Any] = {**_with(options, weight), "iterations": iterations}
         if chosen.get("start") is not None:
             chosen["start"] = chosen["start"][samples]
         parts.update(zip(samples, method(A, views[samples], **chosen), strict=True))

@@ -73,12 +73,8 @@ def tv_proximal(
     rate = dual_rate(shrinkage) if rate is None else rate
     if rate == 0:
         return (volume.clamp_min(0) if shrinkage.nonnegative else volume), dual
-    kernels, last, t, momentum = (
-        differences.differences_for(volume),
-        torch.zeros_like(dual),
-        1.0,
-        0.0,
-    )
+    kernels, last = differences.differences_for(volume), torch.zeros_like(dual)
+    t, momentum = 1.0, 0.0
     for _ in range(iterations):
         stride = differences.Stride(rate, momentum)
         dual, last = kernels.proximal_step(volume, dual, last, stride, shrinkage), dual
@@ -206,20 +202,6 @@ def fista_tv(
 SEARCH_FACTOR = 2.0
 
 
-class Bound(NamedTuple):
-    """A linear lower bound of the data term and the total variation, scaled by c.
-
-    Args:
-        views: q, a multiplier of the residual views.
-        back: A^T q.
-        field: p, without unit, vectors of length at most 1; None without total variation.
-    """
-
-    views: Float[Tensor, "b c m v u"]
-    back: Float[Tensor, "b c d h w"]
-    field: Float[Tensor, "3 b c d h w"] | None
-
-
 class PenalisedFit(NamedTuple):
     """The objective |y - A x|^2_R / (2 c) + weight sum |D x|, in the square of the unit of the
     volume.
@@ -242,7 +224,9 @@ class PenalisedFit(NamedTuple):
         self,
         volume: Float[Tensor, "b c d h w"],
         residual: Float[Tensor, "b c m v u"],
-        bound: Bound,
+        multiplier: Float[Tensor, "b c m v u"],
+        back: Float[Tensor, "b c d h w"],
+        field: Float[Tensor, "3 b c d h w"] | None,
     ) -> Float[Tensor, "b c"]:
         """Return an upper bound of the objective's excess over its minimum, relative to the
         objective.
@@ -254,18 +238,20 @@ class PenalisedFit(NamedTuple):
         Args:
             volume: x.
             residual: y - A x.
-            bound: lower bound by the method's dual steps.
+            multiplier: q, of the residual views; scaled by c, as the two that follow.
+            back: A^T q.
+            field: p, without unit, vectors of length at most 1; None without total variation.
         """
         row, level = self.fit.weights.row, self.fit.level
-        misfit = torch.where(row > 0, residual - bound.views / torch.where(row > 0, row, 1), 0)
-        terms, slope = [_sum(row * misfit.square()) / (2 * level)], -bound.back / level
+        misfit = torch.where(row > 0, residual - multiplier / torch.where(row > 0, row, 1), 0)
+        terms, slope = [_sum(row * misfit.square()) / (2 * level)], -back / level
         value = _sum(row * residual.square()) / (2 * level)
-        if bound.field is not None:
+        if field is not None:
             change = differences.gradient(volume, self.steps)
             size = torch.linalg.vector_norm(change, dim=0)
             value = value + self.weight * _sum(size)
-            terms.append(self.weight * _sum(size - (bound.field * change).sum(dim=0)))
-            slope = slope + self.weight * differences.gradient_adjoint(bound.field, self.steps)
+            terms.append(self.weight * _sum(size - (field * change).sum(dim=0)))
+            slope = slope + self.weight * differences.gradient_adjoint(field, self.steps)
         if self.support is not None:
             slope = slope * self.support
         reach = SEARCH_FACTOR * volume.abs().flatten(2).amax(dim=2)[..., None, None, None]
@@ -390,7 +376,7 @@ def _primal_dual(
         if problem.monitor is not None:
             gap = None
             if number % GAP_INTERVAL == 0 or number == problem.iterations:
-                gap = objective.gap(volume, of_volume, Bound(multiplier, back, fresh))
+                gap = objective.gap(volume, of_volume, multiplier, back, fresh)
             yield solver.Step(volume, of_volume, gap)
         target = (multiplier + balance * fit.weights.row * beyond) / (1 + balance)
         multiplier = multiplier.lerp(target, RELAXATION)

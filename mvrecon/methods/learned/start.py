@@ -179,9 +179,8 @@ def content_scale(volume: Float[Tensor, "b 1 d h w"]) -> Float[Tensor, "b 1 1 1 
     peak = volume.abs().amax(dim=(1, 2, 3, 4), keepdim=True)
     peak = torch.where(peak > 0, peak, 1.0)
     part = (volume / peak).abs()
-    scale = part.square().sum(dim=(1, 2, 3, 4), keepdim=True) / part.sum(
-        dim=(1, 2, 3, 4), keepdim=True
-    ).clamp_min(1)
+    squares, total = (x.sum(dim=(1, 2, 3, 4), keepdim=True) for x in (part.square(), part))
+    scale = squares / total.clamp_min(1)
     return torch.where(scale > 0, scale * peak, 1.0)
 
 

@@ -91,10 +91,8 @@ class Frusta:
         edges = lattice.depth_edges(seen_depth_range(cameras, grid), depth)
         world, frusta = lattice.grid_lattice(grid), frusta_lattice(cameras, grid, edges)
         # coordinates of voxels in frusta, and of bins in the grid
-        frusta_from_world, world_from_frusta = (
-            lattice.lattice_maps(frusta, world),
-            lattice.lattice_maps(world, frusta),
-        )
+        frusta_from_world = lattice.lattice_maps(frusta, world)
+        world_from_frusta = lattice.lattice_maps(world, frusta)
         ahead = frusta.ahead[:, None, :, None]
         shape = depth, *cameras.shape
         bins = lattice.enclosed(world_from_frusta[0, :, None], grid.shape, shape)

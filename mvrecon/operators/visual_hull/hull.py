@@ -200,9 +200,8 @@ def _witnesses(
     undecided = torch.arange(len(places), device=device)
     rounds = -(-len(cameras) // max(1, PASS_VIEWS // batch))
     for turn in range(rounds):
-        chosen = list(
-            range(turn, len(cameras), rounds)
-        )  # far apart on most rigs, so that they differ
+        # far apart on most rigs, so that they differ
+        chosen = list(range(turn, len(cameras), rounds))
         table = footprints.summed_area_tables(foreground[:, chosen])
         for some in undecided.split(max(1, footprints.AT_ONCE // (batch * len(chosen)))):
             prints = footprints.footprints(

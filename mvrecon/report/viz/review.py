@@ -177,11 +177,7 @@ def scan(case: CaseSheets, volume: Float[Tensor, "d h w"]) -> images.Image:
 
 
 def save_planes(
-    path: str | Path,
-    volume: Float[Tensor, "d h w"],
-    grid: Grid,
-    unit: str = "",
-    title: str = "",
+    path: str | Path, volume: Float[Tensor, "d h w"], grid: Grid, unit: str = "", title: str = ""
 ) -> None:
     """Write three planes of a volume as a PNG image with a scale bar in mm and a colour bar, as
     `planes.png` of `mvrecon-reconstruct`; an existing file is replaced atomically.

@@ -36,9 +36,7 @@ def monai_basic_unet(inputs: int, outputs: int, width: int = 32) -> nn.Module:
     """
     _check(width)
     with needs("monai"):
-        from monai.networks.nets.basic_unet import (
-            BasicUNet,
-        )
+        from monai.networks.nets.basic_unet import BasicUNet
 
     widths = [width * times for times in (1, 1, 2, 4, 8, 1)]
     return _sized(BasicUNet(3, inputs, outputs, widths, norm=_norm(width)), 16)
@@ -100,9 +98,7 @@ def monai_segresnet(inputs: int, outputs: int, width: int = 16) -> nn.Module:
     """
     _check(width)
     with needs("monai"):
-        from monai.networks.nets.segresnet import (
-            SegResNet,
-        )
+        from monai.networks.nets.segresnet import SegResNet
 
     return _sized(SegResNet(3, width, inputs, outputs, norm=_norm(width)), 8)
 
@@ -128,9 +124,7 @@ def monai_swin_unetr(inputs: int, outputs: int, width: int = 24) -> nn.Module:
     with needs("einops"):
         import einops  # noqa: F401
     with needs("monai"):
-        from monai.networks.nets.swin_unetr import (
-            SwinUNETR,
-        )
+        from monai.networks.nets.swin_unetr import SwinUNETR
 
     network = SwinUNETR(inputs, outputs, feature_size=width, norm_name=_norm(width))
     return _sized(network, 32)

@@ -16,10 +16,7 @@ from mvrecon_peers.astra import Astra
 
 
 def astra_fbp(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    filter: str = "ram-lak",
-    method: str = "linear",
+    A: Projector, views: Float[Tensor, "b 1 m v u"], filter: str = "ram-lak", method: str = "linear"
 ) -> Float[Tensor, "b 1 d h w"]:
     """Filtered back-projection by ASTRA's FBP, in (unit of the views) / mm.
 
@@ -37,10 +34,7 @@ def astra_fbp(
 
 
 def astra_sirt(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    iterations: int = 50,
-    method: str = "linear",
+    A: Projector, views: Float[Tensor, "b 1 m v u"], iterations: int = 50, method: str = "linear"
 ) -> Float[Tensor, "b 1 d h w"]:
     """ASTRA's SIRT with a non-negativity constraint, in (unit of the views) / mm.
 
@@ -58,10 +52,7 @@ def astra_sirt(
 
 
 def astra_cgls(
-    A: Projector,
-    views: Float[Tensor, "b 1 m v u"],
-    iterations: int = 20,
-    method: str = "linear",
+    A: Projector, views: Float[Tensor, "b 1 m v u"], iterations: int = 20, method: str = "linear"
 ) -> Float[Tensor, "b 1 d h w"]:
     """Conjugate gradients for least squares by ASTRA's CGLS, in (unit of the views) / mm.
 

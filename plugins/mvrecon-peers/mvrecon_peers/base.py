@@ -1,14 +1,16 @@
-"""Base classes of the peers: input checks, adjoints by a pair of calls or by autograd, import of
-the libraries.
+"""Base classes of the peers: input checks, a custom torch operator, for `torch.compile`, autocast,
+vmap and derivatives, adjoints by a pair of calls or by autograd, import of the libraries.
 """
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from io import StringIO
+from itertools import count
 from typing import Any
+from weakref import WeakValueDictionary
 
 import torch
 from jaxtyping import Float
@@ -21,7 +23,6 @@ from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.operators.checks import check, check_floating
 from mvrecon.operators.memo import FixedGeometry
 from mvrecon_peers.frame import framed, near, wants_gradient
-from mvrecon_peers.operator import known_by, linear
 
 CPU = torch.device("cpu")
 
@@ -48,6 +49,54 @@ def quiet() -> Iterator[None]:
     with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         warnings.simplefilter("ignore")
         yield
+
+
+_PEERS: WeakValueDictionary[int, Any] = WeakValueDictionary()
+_KEYS = count()
+
+
+def known_by(peer: Any) -> int:
+    """Register a peer under a number, by which `linear` finds it while it exists: operators do not
+    accept objects.
+    """
+    key = next(_KEYS)
+    _PEERS[key] = peer
+    return key
+
+
+@torch.library.custom_op("mvrecon_peers::linear", mutates_args=())
+def linear(operand: Tensor, key: int, back: bool) -> Tensor:
+    """Project volumes [n d h w] to views [n m v u] with a peer, or back-project."""
+    peer = _PEERS[key]
+    act: Callable[[Tensor], Tensor] = peer.backproject if back else peer.project
+    result = operand.new_empty(operand.shape[0], *peer.sizes(back))
+    with torch.autocast(operand.device.type, enabled=False):
+        for one, out in zip(operand, result, strict=True):
+            out.copy_(act(one.contiguous()))
+    return result
+
+
+@linear.register_fake
+def _(operand, key, back):
+    return operand.new_empty(operand.shape[0], *_PEERS[key].sizes(back))
+
+
+def _keep(ctx, inputs, output):
+    _, ctx.key, ctx.back = inputs
+    ctx.peer = _PEERS[ctx.key]  # keeps the peer alive until backward
+
+
+def _transpose(ctx, grad):
+    return linear(grad, ctx.key, not ctx.back), None, None
+
+
+def _mapped(info, in_dims, operand, key, back):
+    moved = operand.movedim(in_dims[0], 0)
+    return linear(moved.flatten(0, 1), key, back).unflatten(0, moved.shape[:2]), 0
+
+
+linear.register_autograd(_transpose, setup_context=_keep)
+linear.register_vmap(_mapped)
 
 
 class Peer(FixedGeometry):
@@ -191,9 +240,8 @@ class Traced(Peer):
         return torch.get_num_threads() if device.type == "cpu" else len(self.cameras)
 
     def _parts(self, volume: Tensor) -> Iterator[Tensor]:
-        for first, last in zip(
-            *(p.split(self.at_once(volume.device)) for p in self._rays(volume)), strict=True
-        ):
+        parts = (ends.split(self.at_once(volume.device)) for ends in self._rays(volume))
+        for first, last in zip(*parts, strict=True):
             yield self.render(volume, first, last).unflatten(1, self.cameras.shape)
 
     def project(self, volume: Float[Tensor, "d h w"]) -> Float[Tensor, "m v u"]:

@@ -136,9 +136,8 @@ def plane_of_rows(box: Grid, rig: Cameras, who: str) -> list[tuple[int, int]]:
         ValueError: rays that leave a slice's central plane, or rows whose pixels are not aligned
             along z.
     """
-    z = (
-        torch.stack([ends[..., 2] for ends in rig.rays()]).transpose(0, 2).flatten(1)
-    )  # [rows, everything else]
+    # [rows, everything else]
+    z = torch.stack([ends[..., 2] for ends in rig.rays()]).transpose(0, 2).flatten(1)
     index = z / box.spacing[2] + (box.shape[0] - 1) / 2
     slices = index.mean(dim=-1).round()
     off = (index - slices[:, None]).abs().max().item()

@@ -105,14 +105,10 @@ def _table(text: str, options: Mapping[str, float | None]) -> dict[str, Float[Te
             raise ValueError(f"expected {name} in the table or as an option, got it in both")
         if name not in names and value is None and absent is None:
             raise ValueError(f"expected {name}, a column of the table or an option, got {names}")
-        column = (
-            [
-                common.number(row[names.index(name)], f"{name} of view {m}")
-                for m, row in enumerate(rows)
-            ]
-            if name in names
-            else [absent if value is None else float(value)] * len(rows)
-        )
+        column = [absent if value is None else float(value)] * len(rows)
+        if name in names:
+            texts = [row[names.index(name)] for row in rows]
+            column = [common.number(text, f"{name} of view {m}") for m, text in enumerate(texts)]
         table[name] = torch.tensor(column, dtype=torch.float64)
     return table
 

@@ -264,14 +264,14 @@ def write(cameras: Cameras, path: str | Path, world: str = "LPS") -> None:
         (axes * point[:, None]).sum(dim=-1) for point in (rig.source, rig.detector_centre)
     )
     common.check_distances(source[:, 2], source[:, 2] - centre[:, 2])
-    views = list(zip(axes.tolist(), source.tolist(), centre.tolist(), strict=True))
-    angles = [gantry_angles(view[0]) for view in views]
+    angles = [gantry_angles(view) for view in axes.tolist()]
     gantries = common.unmistakable([math.degrees(angle[0]) for angle in angles])
     lines = ['<?xml version="1.0"?>', "<!DOCTYPE RTKGEOMETRY>"]
     lines += ['<RTKThreeDCircularGeometry version="3">']
-    for view, gantry, (_, out, inner) in zip(views, gantries, angles, strict=True):
+    places = zip(source.tolist(), centre.tolist(), strict=True)
+    for place, gantry, (_, out, inner) in zip(places, gantries, angles, strict=True):
         degrees = gantry, math.degrees(out), math.degrees(inner)
-        lines += ["  <Projection>", *_view(*view, degrees), "  </Projection>"]
+        lines += ["  <Projection>", *_view(*place, degrees), "  </Projection>"]
     write_text(path, "\n".join([*lines, "</RTKThreeDCircularGeometry>\n"]))
 
 
@@ -282,10 +282,7 @@ def check(cameras: Cameras) -> None:
 
 
 def _view(
-    axes: list[list[float]],
-    source: list[float],
-    centre: list[float],
-    degrees: tuple[float, float, float],
+    source: list[float], centre: list[float], degrees: tuple[float, float, float]
 ) -> list[str]:
     """The lines of one view with gantry, out-of-plane and in-plane angle; RTK rejects a file whose
     matrix does not match its parameters.

@@ -67,10 +67,7 @@ class Header:
 
 
 def write_shard(
-    path: Path,
-    header: Header,
-    indices: range,
-    make: Callable[[int], dict[str, np.ndarray]],
+    path: Path, header: Header, indices: range, make: Callable[[int], dict[str, np.ndarray]]
 ) -> None:
     """Write the events with the given indices one at a time; the file is written atomically.
 
@@ -139,10 +136,7 @@ def verify(path: Path) -> None:
     Raises:
         Refused: the file is damaged; the message contains its path.
     """
-    with (
-        file_errors(path, "is damaged", "delete it to have it made again"),
-        reading(path) as file,
-    ):
+    with file_errors(path, "is damaged", "delete it to have it made again"), reading(path) as file:
         for array in checked(path, file).values():
             check_chunks(path, array)
             for k in range(0, len(array), array.chunks[0] if array.chunks else 1):

@@ -24,7 +24,7 @@ NO = ("n", "no", "none", "0")
 #: not listed is refused, except of ignored keys without any.
 KEYS = (
     Key("name of data file", "applied", "beside the header"),
-    *(Key(name, "applied") for name in ("number format", "number of bytes per pixel")),
+    Key("number format, number of bytes per pixel", "applied"),
     Key("imagedata byte order", "applied", "image data is imagedata; big endian if missing"),
     Key(_first("data offset in bytes"), "applied"),
     Key("data starting block", "compared", "with the offset, which is 2048 bytes per block"),

@@ -38,9 +38,7 @@ ROUNDED, STRAIGHT = 1e-3, 1e-6
 
 
 def read_interfile(
-    path: str | Path,
-    world: str = "RAS",
-    place: Literal["header", "centred"] = "header",
+    path: str | Path, world: str = "RAS", place: Literal["header", "centred"] = "header"
 ) -> tuple[Float[Tensor, "d h w"], Grid]:
     """Read an Interfile volume: its stored values as float32, and its grid in mm.
 

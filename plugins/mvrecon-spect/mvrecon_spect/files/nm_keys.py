@@ -26,11 +26,8 @@ COUNTS = ("{counts}", "{count}", "counts", "count", "cnts", "1")
 #: dead time makes, and types of images that are none of a camera at rest.
 CORRECTED = {"ATTN", "SCAT", "DECY", "RAN", "DCAL", "DTIM", "CLN"}
 OTHERWISE = {"TRANSMISSION", "RECON", "WHOLE"}
-#: Attributes of which a study with several values is read with a warning, and what these need.
-DIFFER = {
-    "TableTraverse": "which the cameras must have",
-    "TableHeight": "which the cameras must have",
-}
+#: Attributes of which a study with several values is read with a warning.
+DIFFER = ("TableTraverse", "TableHeight")
 #: Difference of the times of slots in ms that is rounding, as of 857 ms in 4 slots.
 ROUNDED_MS = 1.0
 #: Attributes of measured views besides `mvrecon.data.dicom_image.KEYS`.
@@ -83,7 +80,6 @@ KEYS = (
         "of the detector with one rotation, else of the rotation; both must have one in common",
     ),
     Key("AngularStep", "applied", "not negative"),
-    Key("RotationDirection", "applied"),
     Key("ScanArc, NumberOfFramesInRotation", "compared", "with AngularStep and AngularViewVector"),
     Key("RadialPosition", "applied", "as StartAngle; one value, or one of each view"),
     Key(
@@ -96,8 +92,7 @@ KEYS = (
     Key(
         "CardiacFramingType", "applied", "of slots framed BACK from an R wave the start is unknown"
     ),
-    *(Key(name, "applied") for name in ("PhaseDelay", "PauseBetweenFrames")),
-    Key("NumberOfFramesInPhase", "applied"),
+    Key("RotationDirection, PhaseDelay, PauseBetweenFrames, NumberOfFramesInPhase", "applied"),
     Key("PixelSpacing", "compared", "with the cameras' pixel size, by paired"),
     Key(
         "AcquisitionDateTime, AcquisitionDate, AcquisitionTime",
@@ -150,11 +145,12 @@ def check_alike(image: DicomImage) -> None:
             f"{image.path}: expected one ZoomFactor of all detectors, which have one PixelSpacing, "
             f"got {shown(zooms)}; write a file for each"
         )
-    for name, need in DIFFER.items():
+    for name in DIFFER:
         values = image.anywhere(name)
         if other := [value for value in values if not same(value, values[0])]:
             warnings.warn(
-                f"{image.path}: has several values of {name}, {values[0]} and {other[0]}, {need}",
+                f"{image.path}: has several values of {name}, {values[0]} and {other[0]}, which "
+                f"the cameras must have",
                 stacklevel=3,
             )
     with file_errors(image.path, "describes its time slots wrongly"):

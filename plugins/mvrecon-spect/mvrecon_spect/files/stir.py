@@ -55,7 +55,7 @@ def read_stir(
         ValueError: an impossible geometry; see `StirSystem`.
     """
     header = read_header(path, "projections")
-    system = _system(header, detector_file, collimator_file)
+    system = system_of(header, detector_file, collimator_file)
     numbers = numbers_of(header, (len(system.angles), *system.shape))
     counts = torch.from_numpy(numbers.read(0, len(system.angles)))
     if not (counts.isfinite().all() and (counts >= 0).all()):
@@ -63,18 +63,10 @@ def read_stir(
     return StirScan(system, counts[None, None])
 
 
-def read_system(
-    path: str | Path,
-    detector_file: str | Path | None = None,
-    collimator_file: str | Path | None = None,
-) -> StirSystem:
-    """Read the geometry of STIR's pinhole system in mm, without the counts; see `read_stir`."""
-    return _system(read_header(path, "projections"), detector_file, collimator_file)
-
-
-def _system(
+def system_of(
     header: Header, detector_file: str | Path | None, collimator_file: str | Path | None
 ) -> StirSystem:
+    """The geometry of STIR's pinhole system in mm; see `read_stir`."""
     detector_file = detector_file or header.path.parent / "detector.txt"
     collimator_file = collimator_file or header.path.parent / "collimator.txt"
     detector = read_detector(detector_file)
@@ -123,7 +115,7 @@ def stir_pinhole(
     Raises:
         ValueError: several holes per detector, which require `operator_of`; see `read_stir`.
     """
-    system = read_system(path, detector_file, collimator_file)
+    system = system_of(read_header(path, "projections"), detector_file, collimator_file)
     if system.holes != 1:
         raise ValueError(
             f"{path}: expected one hole a detector for a rig of cameras, got {system.holes}; "

@@ -11,7 +11,8 @@ from torch import Tensor
 from mvrecon.geometry.cameras.camera import Cameras
 from mvrecon.geometry.grid import Grid
 from mvrecon.operators.operator import LinearOperator, Projector, Scaled
-from mvrecon_spect.files.stir import read_system
+from mvrecon_spect.files.interfile import read_header
+from mvrecon_spect.files.stir import system_of
 from mvrecon_spect.files.stir_system import StirSystem, accepted, cameras_of
 from mvrecon_spect.files.stir_text import Opening
 from mvrecon_spect.operators.matter import MuOption
@@ -77,7 +78,7 @@ def stir_projector(
     Raises:
         ValueError: cameras at other positions; see `operator_of` and `stir_pinhole`.
     """
-    system = read_system(path, detector_file, collimator_file)
+    system = system_of(read_header(path, "projections"), detector_file, collimator_file)
     known = cameras_of(system, world)
     apart = torch.cdist(_places(cameras), _places(known))
     nearest, far = apart.argmin(dim=1), apart.amin(dim=1).max().item()

@@ -92,10 +92,8 @@ def read_detector(path: str | Path) -> DetectorText:
     path = Path(path)
     fields = _Fields(path)
     count = fields.whole("number of rings")
-    sigma, crystal = (
-        CM * fields.number("sigma", "cm"),
-        CM * fields.number("crystal thickness", "cm"),
-    )
+    sigma = CM * fields.number("sigma", "cm")
+    crystal = CM * fields.number("crystal thickness", "cm")
     attenuation = fields.number("crystal attenuation coefficient", "cm") / CM
     rings = tuple(
         Ring(

@@ -11,14 +11,7 @@ import torch
 
 from mvrecon.kernels.operator import to_accumulation_dtype
 from mvrecon.kernels.threads import parallel_for
-from mvrecon_spect.kernels.loops import (
-    BLOCK,
-    NUMBERS,
-    ROW,
-    VALUES,
-    adjoint,
-    forward,
-)
+from mvrecon_spect.kernels.loops import BLOCK, NUMBERS, ROW, VALUES, adjoint, forward
 from mvrecon_spect.kernels.profile import PIECES, TERMS
 
 #: Parts of the work of `project`, by cameras and, if these are fewer, groups of slices; slices that

@@ -12,7 +12,6 @@ from torch import Tensor
 from mvrecon.core.quantities import NonNegativeInt, PositiveFloat, PositiveInt
 from mvrecon.data.resample import resample
 from mvrecon.data.volume_files import read_volume
-from mvrecon.geometry.grid import Grid
 from mvrecon.methods.classical.mlem import mlem
 from mvrecon.methods.classical.solver import Common, declares
 from mvrecon.operators.operator import Derived, LinearOperator
@@ -58,9 +57,8 @@ def kernel_matrix(
     line = torch.arange(-reach, reach + 1, device=f.device).square().float()
     far = (line[:, None, None] + line[:, None] + line).flatten()
     places, weights = [], []
-    for own, rows, values, numbers in zip(
-        f, every, near, names, strict=True
-    ):  # in slices, to save memory
+    # In slices, to save memory.
+    for own, rows, values, numbers in zip(f, every, near, names, strict=True):
         apart = (values.reshape(own.numel(), -1) - own.reshape(-1, 1)).abs()
         apart = apart.nan_to_num(nan=ABSENT, posinf=ABSENT)
         limit = _last(apart, neighbours)
@@ -74,9 +72,8 @@ def kernel_matrix(
         places.append(torch.stack([rows.flatten()[at[0]], columns]))
         weights.append(weight[at])
     size = f.numel(), f.numel()
-    return torch.sparse_coo_tensor(
-        torch.cat(places, dim=1), torch.cat(weights), size, check_invariants=False
-    ).coalesce()
+    entries = torch.cat(places, dim=1), torch.cat(weights)
+    return torch.sparse_coo_tensor(*entries, size, check_invariants=False).coalesce()
 
 
 def _last(values: Float[Tensor, "n k"], count: int) -> Float[Tensor, "n 1"]:
@@ -116,12 +113,6 @@ def by_rows(K: Float[Tensor, "n n"]) -> Float[Tensor, "n n"]:
         return K.to_sparse_csr()
 
 
-def _resampled(path: str | Path, grid: Grid) -> Float[Tensor, "d h w"]:
-    """The values of a file less their minimum on a grid; zero, as of air, outside the file."""
-    values, source = read_volume(path)
-    return resample(values - values.min(), source, grid)
-
-
 @declares(data_kind="counts", iterates=True, differentiable=False)
 def kem(
     A: Any,
@@ -153,8 +144,10 @@ def kem(
     Raises:
         ValueError: no anatomy, or an anatomy of the wrong shape; see `mlem` and `kernel_matrix`.
     """
-    anatomy = A.mu_map() if anatomy is None else anatomy
-    f = _resampled(anatomy, A.grid) if isinstance(anatomy, str | Path) else anatomy
+    f = A.mu_map() if anatomy is None else anatomy
+    if isinstance(f, str | Path):
+        values, source = read_volume(f)
+        f = resample(values - values.min(), source, A.grid)  # zero, as of air, outside the file
     if f is None or f.shape != A.domain_shape:
         got = None if f is None else tuple(f.shape)
         raise ValueError(f"Expected an anatomy of {tuple(A.domain_shape)} voxels, got {got}")

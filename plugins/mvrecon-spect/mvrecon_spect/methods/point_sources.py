@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.grid import Grid
+from mvrecon.geometry.grid import Grid, pixel_centres
 from mvrecon.operators.checks import check_floating
 from mvrecon_spect.kernels import reference
 from mvrecon_spect.operators.hole import Hole
@@ -162,9 +162,7 @@ def image_widths(
     pitch = torch.stack([cameras.u.norm(dim=1), cameras.v.norm(dim=1)], dim=1)
     across = torch.stack([cameras.u, cameras.v], dim=1) / pitch[:, :, None]
     normal = torch.linalg.cross(across[:, 0], across[:, 1])
-    index = torch.stack(
-        torch.meshgrid(torch.arange(columns), torch.arange(rows), indexing="xy"), dim=-1
-    ).double()
+    index = pixel_centres(cameras.shape)
     end, table = index.new_tensor([columns - 1, rows - 1]), []
     for s, point in enumerate(points.double()):
         for c, counts in enumerate(views[s].double()):

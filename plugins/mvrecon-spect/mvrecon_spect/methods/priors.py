@@ -100,9 +100,8 @@ def log_cosh(level: Float[Tensor, "b c 1 1 1"] | float, delta: float = 0.1) -> P
         raise ValueError(f"Expected a positive, finite delta, got {delta}")
 
     def cost(one: Tensor, other: Tensor) -> Tensor:
-        u = (one - other).abs().double() / (
-            delta * level
-        )  # avoids cancellation of small differences
+        # Doubles, as small differences cancel.
+        u = (one - other).abs().double() / (delta * level)
         return delta**2 * level * (u + torch.log1p(0.5 * torch.expm1(-2 * u)))
 
     def slopes(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:

@@ -57,10 +57,8 @@ def tv_map(
     solver.check_not_negative(weight=weight)
     if not balance > 0:
         raise ValueError(f"Expected a positive balance, got {balance}")
-    steps, problem = (
-        voxel_steps(A),
-        solver.InverseProblem.of(A, counts, iterations, common, background),
-    )
+    steps = voxel_steps(A)
+    problem = solver.InverseProblem.of(A, counts, iterations, common, background)
     plain = PoissonLikelihood(problem.A, problem.views, problem.background)
     s = plain.sensitivity(problem.views.dtype)
     unit = uniform([plain], s)[..., :1, :1, :1]

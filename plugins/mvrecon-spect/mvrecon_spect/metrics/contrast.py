@@ -128,9 +128,7 @@ def count_bias(
 
 
 def defect_contrast(
-    volume: Float[Tensor, "d h w"],
-    defect: Bool[Tensor, "d h w"],
-    normal: Bool[Tensor, "d h w"],
+    volume: Float[Tensor, "d h w"], defect: Bool[Tensor, "d h w"], normal: Bool[Tensor, "d h w"]
 ) -> float:
     """Contrast of a defect, 1 - (mean of the defect) / (mean of normal myocardium), dimensionless:
     0 means no defect, 1 no activity in the defect.

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from mvrecon.core.numbers import divided
 from mvrecon.data.scenes.phantoms import sector_wells
 from mvrecon.geometry.grid import Grid
 from mvrecon.geometry.lattice import normalised, sample
@@ -80,7 +81,7 @@ def valley_to_peak(
         )
         left, valley, right = _means(volume, grid, points @ to_world.T + origin).unbind(dim=1)
         peak = (left + right) / 2
-        ratios = torch.where(peak > 0, valley / torch.where(peak > 0, peak, 1), torch.inf)
+        ratios = divided(valley, peak, torch.inf)
         sectors.append(Sector(float(diameter), ratios))
     return sectors
 

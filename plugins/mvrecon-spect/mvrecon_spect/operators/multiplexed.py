@@ -1,35 +1,14 @@
 """Several pinholes per detector, with overlapping images."""
 
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.operators.operator import Composed, LinearOperator
+from mvrecon.operators.operator import Derived, LinearOperator
 from mvrecon.operators.selection import ViewSelection
 
 
-class SummedHoles(LinearOperator):
-    """Sum the images of n consecutive pinholes, views [b c m*n v u] to [b c m v u].
-
-    Raises:
-        ValueError: the number of views is not a multiple of n.
-    """
-
-    def __init__(self, shape: tuple[int, ...], holes: int):
-        count, *pixels = shape
-        if holes < 1 or count % holes:
-            raise ValueError(f"Expected {holes} pinholes on every detector, got {count} in all")
-        self.holes, self.domain_shape = holes, tuple(shape)
-        self.range_shape = (count // holes, *pixels)
-
-    def forward(self, x: Float[Tensor, "b c n v u"]) -> Float[Tensor, "b c m v u"]:
-        return x.unflatten(2, (-1, self.holes)).sum(dim=3)
-
-    def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c n v u"]:
-        return y.repeat_interleave(self.holes, dim=2)
-
-
-class Multiplexed(Composed):
+class Multiplexed(nn.Module, Derived):
     """Counts [b c m v u] of m detectors, each the sum of the images of n pinholes.
 
     Args:
@@ -42,8 +21,12 @@ class Multiplexed(Composed):
     """
 
     def __init__(self, A: LinearOperator, holes: int):
-        super().__init__(SummedHoles(A.range_shape, holes), A)
-        self.holes = holes
+        super().__init__()
+        count, *pixels = A.range_shape
+        if holes < 1 or count % holes:
+            raise ValueError(f"Expected {holes} pinholes on every detector, got {count} in all")
+        self.A, self.holes = A, holes
+        self.domain_shape, self.range_shape = A.domain_shape, (count // holes, *pixels)
         rig: Cameras | None = getattr(A, "cameras", None)  # single bins have none
         if rig is None:
             return
@@ -55,6 +38,16 @@ class Multiplexed(Composed):
                 f"Expected {holes} consecutive pinholes with one detector, got that of pinhole "
                 f"{view} {apart.max():.3g} mm from that of {view - view % holes}"
             )
+
+    def forward(self, x: Float[Tensor, "b c d h w"]) -> Float[Tensor, "b c m v u"]:
+        return self.A(x).unflatten(2, (-1, self.holes)).sum(dim=3)
+
+    def adjoint(self, y: Float[Tensor, "b c m v u"]) -> Float[Tensor, "b c d h w"]:
+        return self.A.adjoint(y.repeat_interleave(self.holes, dim=2))
+
+    def mu_map(self) -> Float[Tensor, "d h w"] | None:
+        """A's."""
+        return self.A.mu_map()
 
     def subset(self, selection: LinearOperator) -> LinearOperator:
         """Operator of a subset of detectors with their pinholes; subsets of pixels are computed

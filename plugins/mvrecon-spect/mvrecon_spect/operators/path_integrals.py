@@ -188,8 +188,5 @@ def _sample(
 ) -> Float[Tensor, "d h w"]:
     """Linear interpolation of a volume at places from -1 to 1."""
     return F.grid_sample(
-        volume[None, None],
-        places[None].to(volume),
-        padding_mode=padding,
-        align_corners=True,
+        volume[None, None], places[None].to(volume), padding_mode=padding, align_corners=True
     )[0, 0]

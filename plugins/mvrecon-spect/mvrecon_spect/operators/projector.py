@@ -256,9 +256,7 @@ def check_thin(method: str, cameras: Cameras, grid: Grid, blur: bool, attenuated
         )
 
 
-def warn_of_unseen(
-    cameras: Cameras, grid: Grid, support: Bool[Tensor, "d h w"] | None = None
-) -> None:
+def warn_of_unseen(cameras: Cameras, grid: Grid, support: Bool[Tensor, "d h w"] | None) -> None:
     """Warn about possibly nonzero voxels behind a pinhole's plane.
 
     Warns:

@@ -42,11 +42,7 @@ class SpectCt(Scene):
     """
 
     def __init__(
-        self,
-        scene: ScenePart,
-        camera: CameraPart,
-        photons: float = 1e4,
-        iterations: int = 20,
+        self, scene: ScenePart, camera: CameraPart, photons: float = 1e4, iterations: int = 20
     ):
         made: Scene = SCENES.from_config(scene)
         if "mu" not in made.map_names:
