@@ -22,25 +22,25 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.geometry.cameras.camera import Cameras
-from mvrecon.geometry.cameras.field import ROUNDING_ERROR, SAME_ANGLE
+from mvrecon.geometry.cameras.field import ROUNDING_ERROR
 from mvrecon.geometry.grid import Grid
+from mvrecon.methods.classical.missing import Missing
 from mvrecon.methods.classical.orbit import Orbit, along, fan_coordinate, orbit_of
-
-FULL_TURN = 2 * math.pi
+from mvrecon.methods.classical.steps import (
+    FULL_TURN,
+    gaps_of,
+    of_exposures,
+    start_of,
+    usual_steps,
+    widest_of,
+)
 
 #: Fan coordinates at which weights are computed, on each side of the axis; least angles of the
 #: raster of lines, and angles per view.
 FAN_DISTANCES, MIN_ANGLES, ANGLES_PER_VIEW = 128, 1440, 4
-#: A gap between views ends a branch if it is wider than so many usual steps and than the first
-#: angle, or than the second one.
-GAP_STEPS, MIN_GAP, MAX_STEP_ANGLE = 5.0, math.radians(2.0), math.radians(125.0)
-#: Views closer than this part of the usual step are exposures at one angle, and share its cell.
-EXPOSURE_STEP_SHARE = 0.2
 #: Lines in a gap count as not measured, in a warning, where it is so much wider than a usual step
 #: and than an even one.
 NAMED_GAP = math.radians(8.0)
-#: The usual step is the least one such that steps up to it make up this part of the measured arc.
-USUAL_STEP_SHARE = 0.3
 #: A line that no ray measures is replaced by views within this angle, or within so many steps.
 MAX_NEAR_ANGLE, MAX_NEAR_STEPS = math.radians(5.0), 2.0
 #: A branch's share falls to zero over at least this angle.
@@ -50,8 +50,6 @@ MIN_TAPER = math.radians(30.0)
 PANEL_TAPER, NEIGHBOUR_STEPS, NEIGHBOUR_DEVIATIONS = 0.5, 1.0, 4.0
 #: Kinks of a line's distance from the edge of a panel are rounded over this part of the distance.
 ROUNDING = 0.2
-#: A direction in which a scan has no view, and that no symmetry of one keeps.
-ASIDE = (0.81, 0.47, 0.35)
 #: Share of the lines at any one distance from the axis that are not measured, from which a warning
 #: is given: at the rim of a fan whose arc is 8 degrees short values are 2 % off.
 WARNED_MISSING = 0.01
@@ -146,14 +144,15 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
     limit = max(field, reach)
     q = torch.linspace(-limit, limit, 2 * FAN_DISTANCES + 1, dtype=torch.float64)
     # rounding does not make the first view the last one
-    start = _start(orbit)
+    start = start_of(orbit)
     angles = torch.deg2rad(orbit.angles) - start + ROUNDING_ERROR
     angles, order = (angles.remainder(FULL_TURN) - ROUNDING_ERROR).sort()
     edge = torch.minimum(q[:, None] - low[order], high[order] - q[:, None])  # [q m]
     branches = _Branches.of(angles, edge, q, cameras.parallel, min(field, reach))
     # values are those of voxels' centres, and between the angles of two views lines are theirs
-    rim = orbit.cylinder(grid, margin=0.0)[0] * math.cos(_usual(_gaps(angles)) / 2)
-    missing = _Missing.of(branches, branches.measured, orbit, start, rim, offset)
+    usual, _ = usual_steps(gaps_of(angles))
+    rim = orbit.cylinder(grid, margin=0.0)[0] * math.cos(usual.max().item() / 2)
+    missing = Missing.of(branches.measured, q, orbit, start, rim, offset)
     if missing.hole:
         raise ValueError(f"{missing}, which are inside others that are measured; use sirt")
     if missing.share > max_missing:
@@ -162,7 +161,7 @@ def redundancy_weights(cameras: Cameras, grid: Grid, max_missing: float = 0.1) -
             f"Else take a smaller grid, if the object lies within the field, or use sirt"
         )
     near = branches.measured & branches.near
-    bridged = _Missing.of(branches, near, orbit, start, rim, offset)
+    bridged = Missing.of(near, q, orbit, start, rim, offset)
     if bridged.worst > WARNED_MISSING or bridged.share > WARNED_BEYOND:
         warnings.warn(
             f"{bridged}; expect from these alone errors of several per cent on these lines, of "
@@ -206,8 +205,9 @@ def _warn_of_streaks(
     index = int((q - fan).abs().argmin())
     turn, size = (0.0, pixel) if parallel else (q[index].item(), pixel * orbit.radius)
     lines, cells = torch.cat([angles - turn, angles + math.pi + turn]), weights[[index, -1 - index]]
-    gaps = _gaps(lines[cells.flatten() > 0].remainder(FULL_TURN).sort().values)
-    gaps = gaps[gaps <= _widest(_usual(gaps))]
+    gaps = gaps_of(lines[cells.flatten() > 0].remainder(FULL_TURN).sort().values)
+    usual, _ = usual_steps(gaps)
+    gaps = gaps[gaps <= widest_of(torch.minimum(usual, usual.roll(-1)))]
     # the more directions lie near one another, or the more unevenly they are weighted, the wider
     step = max((x.square().sum() / x.sum().clamp_min(1e-300)).item() for x in (gaps, cells))
     blurred = math.sqrt(min(1.0, radius / size / SHARP_PIXELS))
@@ -286,15 +286,18 @@ class _Branches:
     ) -> "_Branches":
         """From sorted angles in radians, and each view's distance from the edges of its panel."""
         taper = max(MIN_TAPER, 0 if parallel else 4 * field)
-        gaps = _gaps(angles)
-        usual = _usual(gaps)
-        count = _raster(len(angles), usual)
+        gaps = gaps_of(angles)
+        usual, even = usual_steps(gaps)
+        count = _raster(len(angles), usual.min().item())
         step = FULL_TURN / count
         places = (torch.arange(count, dtype=torch.float64) + 0.5) * step
-        most = _widest(usual)
-        named = min(most, min(usual, _even(gaps)) + NAMED_GAP)
+        nearest = torch.searchsorted(angles + gaps / 2, places) % len(angles)
+        usual, even = usual[nearest], even[nearest]
+        most = widest_of(usual)
+        named = torch.minimum(most, torch.minimum(usual, even) + NAMED_GAP)
         measured, near = (
-            _covered(angles, places, edge > 0, gap, min(usual, gap)) for gap in (most, named)
+            _covered(angles, places, edge > 0, gap, torch.minimum(usual, gap))
+            for gap in (most, named)
         )
         edge = edge.clamp_min(0)
         index = (angles / step + 1e-6).long().clamp_max(count - 1).expand_as(edge)
@@ -304,7 +307,10 @@ class _Branches:
         level = torch.where(measured, _greatest(level, most / 2 / step + 1), torch.inf)
         level = -_greatest(-level, (most - usual) / 2 / step)
         level = _rounded(torch.where(measured, level, 0), q)
-        reach = max(MAX_NEAR_ANGLE, MAX_NEAR_STEPS * usual)
+        deepest = _greatest(level, usual / step).gather(1, index)
+        # where the other branch has finer steps, it takes the greater share
+        level = level * (usual.min() / usual).sqrt()
+        reach = (MAX_NEAR_STEPS * usual).clamp_min(MAX_NEAR_ANGLE)
         slope = level.amax(dim=1, keepdim=True).clamp_min(1e-300) / taper
         inside = slope * _eroded(level / slope, step)
         without_gaps = slope * _eroded(torch.where(measured, level / slope, taper), step)
@@ -313,21 +319,20 @@ class _Branches:
         lines = torch.stack([level, beside, measured.double(), near.double()])
         other, there, *conjugates = _conjugate(lines, q, parallel)
         # where the other branch does not measure a line, this one does not end at a gap
-        firmness = torch.where(outside.amax(dim=1) > 2 * reach + 1e-9, 8.0, 2.0)[:, None]
+        firmness = torch.where((outside > 2 * reach + 1e-9).any(dim=1), 8.0, 2.0)[:, None]
         firm = (firmness * other / (other + without_gaps).clamp_min(1e-300)).clamp_max(1)
         strength = torch.lerp(without_gaps * beside, inside, firm)
         conjugate = _conjugate(strength, q, parallel)
         ratio = strength / (strength + conjugate).clamp_min(1e-300)
         share = (math.pi / 2 * ratio).sin().square() * torch.maximum(beside, there)
         pairs = zip((measured, near), conjugates, strict=True)
-        level = _greatest(level, usual / step).gather(1, index)
-        return cls(q, parallel, share, edge, level, *(here | (c > 0.5) for here, c in pairs))
+        return cls(q, parallel, share, edge, deepest, *(here | (c > 0.5) for here, c in pairs))
 
     def weights(self, angles: Float[Tensor, " m"]) -> Float[Tensor, "q m"]:
         """The integral of each branch's share over the cells of its views, in radians."""
         count = self.share.shape[1]
         whole = torch.nn.functional.pad(self.share.cumsum(dim=1) * (FULL_TURN / count), (1, 0))
-        place = (angles + _gaps(angles) / 2) / (FULL_TURN / count)
+        place = (angles + gaps_of(angles) / 2) / (FULL_TURN / count)
         turn, place = place.div(count, rounding_mode="floor"), place.remainder(count)
         index = place.floor().long().clamp_max(count - 1)
         upto = torch.lerp(whole[:, index], whole[:, index + 1], place - index)
@@ -337,7 +342,7 @@ class _Branches:
         # changes nothing
         apart = (self.edge - self.edge[:, :1]).abs().max() / (self.q[1] - self.q[0])
         apart = min(apart.item(), 1.0)
-        return _distributed(_of_exposures(cells, angles), angles, self.edge, self.level, apart)
+        return _distributed(of_exposures(cells, angles), angles, self.edge, self.level, apart)
 
 
 def _distributed(
@@ -364,12 +369,13 @@ def _distributed(
         return own
     edge, level = ((x / (PANEL_TAPER * edge.max())).clamp_max(1) for x in (edge, level))
     edge, level = (x.square() * (3 - 2 * x) for x in (edge, level))
-    gaps = _gaps(angles)
-    sigma = NEIGHBOUR_STEPS * _usual(gaps)
-    step = torch.where(gaps > sigma, sigma / NEIGHBOUR_STEPS, gaps)
-    width = _of_exposures(step + step.roll(1), angles)
+    gaps = gaps_of(angles)
+    usual, _ = usual_steps(gaps)
+    sigma = NEIGHBOUR_STEPS * usual
+    width = torch.minimum(gaps, usual) + torch.minimum(gaps.roll(1), usual)
+    width = of_exposures(width, angles)
     ahead = torch.cat([angles, angles + FULL_TURN])
-    ahead = torch.searchsorted(ahead, angles + NEIGHBOUR_DEVIATIONS * sigma + ROUNDING_ERROR)
+    ahead = torch.searchsorted(ahead, angles + NEIGHBOUR_DEVIATIONS * sigma.max() + ROUNDING_ERROR)
     most = int((ahead - torch.arange(1, len(angles) + 1)).max())
     shifts = range(-min(most, (len(angles) - 1) // 2), min(most, (len(angles) - 1) // 2) + 1)
 
@@ -388,11 +394,21 @@ def _distributed(
     return torch.lerp(own, given, apart)
 
 
-def _greatest(level: Float[Tensor, "q n"], reach: float) -> Float[Tensor, "q n"]:
-    """The greatest level within so many places, around the circle."""
-    places = round(reach)
-    level = torch.nn.functional.pad(level[None], (places, places), mode="circular")
-    return torch.nn.functional.max_pool1d(level, 2 * places + 1, stride=1)[0]
+def _greatest(level: Float[Tensor, "q n"], reach: Float[Tensor, " n"]) -> Float[Tensor, "q n"]:
+    """The greatest level within so many places of each, around the circle: of two ranges that cover
+    these, as wide as a power of two.
+    """
+    places, index = reach.round().long(), torch.arange(len(reach))
+    most, doublings = int(places.max()), (2 * places + 1).log2().floor().long()
+    wide, greatest = torch.nn.functional.pad(level[None], (most, most), mode="circular")[0], level
+    for doubling in range(int(doublings.max()) + 1):
+        first, last = index + most - places, index + most + places + 1 - 2**doubling
+        here = (doublings == doubling).nonzero()[:, 0]
+        greatest = greatest.index_copy(
+            1, here, torch.maximum(wide[:, first[here]], wide[:, last[here]])
+        )
+        wide = torch.maximum(wide[:, : -(2**doubling)], wide[:, 2**doubling :])
+    return greatest
 
 
 def _rounded(level: Float[Tensor, "q n"], q: Float[Tensor, " q"]) -> Float[Tensor, "q n"]:
@@ -414,8 +430,8 @@ def _covered(
     angles: Float[Tensor, " m"],
     places: Float[Tensor, " n"],
     seen: Bool[Tensor, "q m"],
-    widest: float,
-    usual: float,
+    widest: Float[Tensor, " n"],
+    usual: Float[Tensor, " n"],
 ) -> Bool[Tensor, "q n"]:
     """Whether views at sorted angles cover places: those that see a fan coordinate, in gaps between
     them of at most so much, and beside wider ones half of the usual step.
@@ -451,57 +467,6 @@ def _raster(views: int, usual: float) -> int:
     return least if steps > least else steps * 2 * math.ceil(least / (2 * steps))
 
 
-def _start(orbit: Orbit) -> float:
-    """The angle behind the widest gap, in radians from the first view; of several as wide the first
-    one after a fixed direction, so that results do not depend on the order of the views.
-    """
-    aside = orbit.axis.new_tensor(ASIDE)
-    zero = torch.atan2(orbit.tangents[0] @ aside, orbit.outwards[0] @ aside)
-    angles = (torch.deg2rad(orbit.angles) - zero).remainder(FULL_TURN).sort().values
-    gaps = _gaps(angles)
-    widest = int((gaps > gaps.max() - ROUNDING_ERROR).int().argmax())
-    return (zero + angles[(widest + 1) % len(angles)]).item()
-
-
-def _gaps(angles: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """The gap behind each of sorted angles, around the circle."""
-    return torch.cat([angles[1:], angles[:1] + FULL_TURN]) - angles
-
-
-def _of_exposures(
-    cells: Float[Tensor, "*n m"], angles: Float[Tensor, " m"]
-) -> Float[Tensor, "*n m"]:
-    """The mean of the cells of the views at each of sorted angles, several exposures or panels."""
-    gaps = _gaps(angles)
-    begins = (gaps > EXPOSURE_STEP_SHARE * _usual(gaps) - ROUNDING_ERROR).roll(1)
-    if begins.all() or not begins.any():
-        return cells
-    number = (begins.cumsum(0) - 1).remainder(int(begins.sum()))  # the first may continue the last
-    sums = cells.new_zeros(*cells.shape[:-1], int(begins.sum())).index_add(-1, number, cells)
-    return (sums / number.bincount())[..., number]
-
-
-def _usual(gaps: Float[Tensor, " m"]) -> float:
-    """The usual step between views, which repeated views do not change."""
-    steps = gaps[(gaps <= MAX_STEP_ANGLE) & (gaps > 0)].sort().values
-    if not len(steps):
-        return MAX_STEP_ANGLE
-    return steps[torch.searchsorted(steps.cumsum(0), USUAL_STEP_SHARE * steps.sum())].item()
-
-
-def _widest(usual: float) -> float:
-    """The widest gap between views that does not end a branch, by their usual step."""
-    return min(max(GAP_STEPS * usual, MIN_GAP), MAX_STEP_ANGLE)
-
-
-def _even(gaps: Float[Tensor, " m"]) -> float:
-    """The step of as many views, spread evenly over the measured arc; smaller than the usual one
-    where views are clustered.
-    """
-    steps = gaps[(gaps <= MAX_STEP_ANGLE) & (gaps > SAME_ANGLE)]
-    return steps.mean().item() if len(steps) else MAX_STEP_ANGLE
-
-
 def _conjugate(
     branches: Float[Tensor, "*n q n"], q: Float[Tensor, " q"], parallel: bool
 ) -> Float[Tensor, "*n q n"]:
@@ -512,104 +477,3 @@ def _conjugate(
     place = (torch.arange(count) + shift.floor().long()).expand(branches.shape)
     here, there = (branches.flip(-2).gather(-1, (place + k) % count) for k in (0, 1))
     return torch.lerp(here, there, shift - shift.floor())
-
-
-@dataclass(frozen=True, eq=False)
-class _Missing:
-    """The lines through a grid's inscribed cylinder that no ray measures.
-
-    Args:
-        share: their share of all lines through it.
-        worst: greatest share of the lines at one distance from the axis of which some are measured.
-        where: where they are, in words.
-        hole: whether no line at some distance from the axis is measured, but lines farther off are.
-        radius: radius of the cylinder, in mm.
-    """
-
-    share: float
-    worst: float
-    hole: bool
-    where: str
-    radius: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.share:.1%} of the lines through the grid's inscribed cylinder, up to its "
-            f"outermost voxels' centres at {self.radius:.4g} mm, are not measured: {self.where}"
-        )
-
-    @classmethod
-    def of(
-        cls,
-        branches: _Branches,
-        measured: Bool[Tensor, "q n"],
-        orbit: Orbit,
-        start: float,
-        radius: float,
-        offset: Float[Tensor, "3"],
-    ) -> "_Missing":
-        """Lines of all branches, by their density in angle and distance.
-
-        Args:
-            measured: whether each of them is.
-            start: where the raster of angles starts, in radians after the first view.
-            radius: radius of the cylinder, in mm.
-            offset: vector from the isocentre to the cylinder, in mm.
-        """
-        count = branches.share.shape[1]
-        q = branches.q[FAN_DISTANCES:]
-        if branches.parallel:
-            s, turn, density = q, torch.zeros_like(q), torch.ones_like(q)
-        else:
-            s, turn, density = orbit.radius * q.sin(), q, q.cos()
-        # direction of the line's normal, in the orbit's plane, from the first view's tangent
-        beta = start + (torch.arange(count, dtype=torch.float64) + 0.5) * (FULL_TURN / count)
-        theta = beta - turn[:, None]
-        tangent = torch.linalg.cross(orbit.axis, orbit.outwards[0])
-        x, y = offset @ orbit.outwards[0], offset @ tangent
-        # a line that is tangent to the cylinder has no length in it
-        through = (s[:, None] - (theta.cos() * y - theta.sin() * x)).abs() < radius * (1 - 1e-6)
-        lines = through * density[:, None]
-        lines[0] *= 0.5  # its other half is the conjugate branch
-        gone = ~measured[FAN_DISTANCES:] & through
-        share = ((gone * lines).sum() / lines.sum().clamp_min(1e-300)).item()
-        everywhere = (gone == through).all(dim=1) & through.any(dim=1)
-        some = gone.any(dim=1) & ~everywhere
-        seen = (through & ~gone).any(dim=1)
-        hole = bool((everywhere & (seen.flip(0).cumsum(0).flip(0) > 0)).any())
-        worst = (gone.double().mean(dim=1) * ~everywhere).max().item()
-        return cls(share, worst, hole, _where(everywhere, some, gone, s, theta), radius)
-
-
-def _where(
-    everywhere: Bool[Tensor, " q"],
-    some: Bool[Tensor, " q"],
-    gone: Bool[Tensor, "q n"],
-    s: Float[Tensor, " q"],
-    theta: Float[Tensor, "q n"],
-) -> str:
-    """The distances from the axis, and the angles, of lines that are not measured."""
-    words = []
-    if everywhere.any():
-        words.append(f"all at {_range(s[everywhere])} mm from the axis of rotation")
-    if some.any():
-        angles = theta[some][gone[some]].rad2deg().remainder(360).round().long()
-        taken = torch.zeros(360, dtype=torch.bool)
-        taken[angles % 360] = True
-        first = int((~taken).int().argmax())  # a run does not begin at 359 if it continues at 0
-        runs = taken.roll(-first).int().diff(prepend=torch.zeros(1, dtype=torch.int32))
-        begins, ends = (runs > 0).nonzero()[:, 0], (runs < 0).nonzero()[:, 0]
-        sizes = torch.cat([ends, torch.tensor([360])])[: len(begins)] - begins
-        best = int(sizes.argmax())
-        start = (int(begins[best]) + first) % 360
-        words.append(
-            f"{'others' if words else 'those'} at {_range(s[some])} mm, up to "
-            f"{gone[some].double().mean(dim=1).max():.1%} of those at one distance, "
-            f"{'mainly ' if len(sizes) > 1 else ''}from {start} to {start + int(sizes[best])} "
-            f"degrees after the first view"
-        )
-    return "; ".join(words)
-
-
-def _range(s: Float[Tensor, " q"]) -> str:
-    return f"{s.min().item():.3g} to {s.max().item():.3g}"
