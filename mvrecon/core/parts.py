@@ -102,10 +102,10 @@ VIEW_FILES = Registry(
     nxs="mvrecon.data.projections.nexus:hdf5_views",
     nx="mvrecon.data.projections.nexus:hdf5_views",
     xtekct="mvrecon.data.projections.nikon:NikonViews",
-    npy="mvrecon.data.projections.stack:NpyViews",
-    mha="mvrecon.data.projections.stack:ItkViews",
-    mhd="mvrecon.data.projections.stack:ItkViews",
-    nrrd="mvrecon.data.projections.stack:ItkViews",
+    npy="mvrecon.data.projections.arrays:NpyViews",
+    mha="mvrecon.data.projections.arrays:ItkViews",
+    mhd="mvrecon.data.projections.arrays:ItkViews",
+    nrrd="mvrecon.data.projections.arrays:ItkViews",
 )
 #: Writers of volumes by ending, beside those of `save_volume`: f(path, grid, unit) -> f(volume),
 #: which refuses what its file cannot hold.

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mvrecon.core.files.keys import Key
 from mvrecon.data import dicom, dicom_image, itk_headers, linked, nifti, nrrd_header, vgi
-from mvrecon.data.projections import dicom_views, nexus, png, rtk_images, tiff
+from mvrecon.data.projections import dicom_views, nexus_keys, png, rtk_images, tiff
 from mvrecon.geometry.cameras.formats import nikon, rtk_xml, tigre
 from mvrecon_spect.files import interfile_keys, nm_keys, nm_volume
 
@@ -32,7 +32,7 @@ FORMATS: dict[str, Sequence[Key]] = {
     "DICOM NM volumes": nm_volume.KEYS,
     "TIFF": tiff.TIFF_KEYS,
     "PNG": png.PNG_KEYS,
-    "HDF5 of beamlines": nexus.KEYS,
+    "HDF5 of beamlines": nexus_keys.KEYS,
     "Attributes of HDF5": linked.ATTRIBUTES,
     "EDF": rtk_images.EDF_KEYS,
     "Elekta's .his": rtk_images.HIS_KEYS,

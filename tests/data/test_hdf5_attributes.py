@@ -8,7 +8,7 @@ import pytest
 
 from mvrecon.core.files.checks import Refused
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.data.projections.stack import Hdf5Views
+from mvrecon.data.projections.arrays import Hdf5Views
 
 VALUES = np.arange(60, dtype="f4").reshape(3, 4, 5)
 COUNTS = {"unit": "counts", "dose": 2.0, "unit_per_dose": "spect of activity"}

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mvrecon.core.numbers import generator
 from mvrecon.data.hdf5 import Stored, VolumeFile, write_volumes
-from mvrecon.data.projections.stack import Hdf5Views
+from mvrecon.data.projections.arrays import Hdf5Views
 from mvrecon.data.projections.views import Measured, MeasuredViews
 from mvrecon.data.projections.writing import Exposure, write_projections
 from mvrecon.data.resample import right_angled
