@@ -37,6 +37,10 @@ COPIED = (
     Key("0028|1040", "refused", "DICOM's PixelIntensityRelationship", ("LIN",)),
     Key("0028|1041", "refused", "DICOM's PixelIntensityRelationshipSign", (1,)),
     Key("0028|1054", "refused", "DICOM's RescaleType", ("HU", "US", "BQML")),
+    Key("0018|7032", "refused", "DICOM's FieldOfViewRotation", (0,)),
+    Key("0018|7034", "refused", "DICOM's FieldOfViewHorizontalFlip", ("NO",)),
+    Key("0028|6100", "refused", "DICOM's subtraction of a mask"),
+    Key("0008|0068", "refused", "DICOM's PresentationIntentType", ("FOR PROCESSING",)),
     Key(", ".join(COPIED_TEXTS), "ignored", SAID),
     Key(
         "????|????, scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, "

@@ -139,6 +139,10 @@ OTHER = {
     "data file": "b.raw",
     "0028|1040": "LOG",
     "0028|1041": "-1",
+    "0018|7032": "90",
+    "0018|7034": "YES",
+    "0028|6100": "[]",
+    "0008|0068": "FOR PRESENTATION",
     "0028|1054": "OD",
 }
 #: Those of DICOM are no fields of NRRD, but pairs.

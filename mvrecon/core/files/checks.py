@@ -9,9 +9,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
+if TYPE_CHECKING:
+    import numpy as np
 
 #: Maximum bytes of a text file, of a YAML file (whose parser is slow), and of an unpacked volume
 #: and chunk of a file.
@@ -260,16 +261,18 @@ def check_file(path: Path, expected: str) -> None:
         raise FileNotFoundError(f"{path}: no such file; expected {expected}")
 
 
-def npy_array(path: Path) -> np.memmap:
+def npy_array(path: Path) -> "np.memmap":
     """The one array of a NumPy file, without reading its values.
 
     Raises:
         FileNotFoundError: nothing is there.
         Refused: no array, Python objects, cut short, or followed by other bytes, as a second array.
     """
+    from numpy.lib.format import open_memmap  # takes a tenth of a second
+
     check_file(path, "a NumPy array")
     with file_errors(path, "cannot be read as a NumPy array"):
-        array = np.lib.format.open_memmap(path, mode="r")
+        array = open_memmap(path, mode="r")
     expected = array.offset + array.nbytes
     if (got := path.stat().st_size) != expected:
         raise Refused(

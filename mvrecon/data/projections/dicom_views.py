@@ -51,8 +51,17 @@ CAMERA_PLACES = (
     "DetectorFocalCenterRadialDistance SourceAngularPositionShift SourceAxialPositionShift "
     "SourceRadialDistanceShift"
 ).split()
-#: Angles by which the camera is turned about the patient.
-PRIMARY = ("PositionerPrimaryAngle", "PositionerIsocenterPrimaryAngle")
+#: Angles by which the camera is turned about the patient, and those by which it is tilted, which
+#: must be within so many degrees from zero.
+PRIMARY = {
+    "PositionerPrimaryAngle": "PositionerSecondaryAngle",
+    "PositionerIsocenterPrimaryAngle": "PositionerIsocenterSecondaryAngle",
+    "GantryAngle": "GantryPitchAngle",
+}
+MAX_TILT = 5.0
+#: Ratio of the greatest to the least of increments from frame to frame; those from the first frame
+#: on differ more.
+MAX_UNEVEN = 1.5
 #: Attributes that say where the object is, or move it; a flat field has none.
 OBJECT_PLACES = [
     *(
@@ -196,11 +205,11 @@ DICOM_KEYS = (
     Key(
         ", ".join((*PRIMARY, "PositionerPrimaryAngleIncrement")),
         "compared",
-        "with the turn of the cameras, where the secondary angle is 0; warned of",
+        "with the turn of the cameras, where they are hardly tilted; warned of",
     ),
     Key(
         "PositionerSecondaryAngle, PositionerSecondaryAngleIncrement, "
-        "PositionerIsocenterSecondaryAngle, BeamAngle, ColumnAngulation, GantryAngle, "
+        "PositionerIsocenterSecondaryAngle, BeamAngle, ColumnAngulation, "
         "GantryPitchAngle, TubeAngle, FramePrimaryAngleVector, FrameSecondaryAngleVector, "
         "XRaySourceIsocenterPrimaryAngle, DetectorIsocenterPrimaryAngle, "
         "DetectorXPositionToIsocenter, DetectorYPositionToIsocenter, DetectorZPositionToIsocenter, "
@@ -258,21 +267,23 @@ def dicom_header(file: Path) -> Header:
 
 
 def _angles(image: DicomImage) -> list[float]:
-    """The primary angles of the positioner in degrees, a number for each frame; none unless they
-    are stated, beside a secondary angle that is zero or missing.
+    """The angles in degrees by which the camera is turned, a number for each frame; none unless
+    they are stated, and it is hardly tilted.
     """
     steps, aside = (
-        np.atleast_1d(image.value(f"Positioner{axis}AngleIncrement") or 0)
+        np.atleast_1d(np.asarray(image.value(f"Positioner{axis}AngleIncrement") or 0, float))
         for axis in ("Primary", "Secondary")
     )
-    for name in PRIMARY:
-        angles, second = image.values(name), image.values(name.replace("Primary", "Secondary"))
-        if None in angles or any(map(float, filter(None, second))) or aside.any():
+    for name, tilt in PRIMARY.items():
+        angles, tilts = image.values(name), [float(t or 0) for t in image.values(tilt)]
+        if None in angles or max(map(abs, tilts)) + abs(aside).max() > MAX_TILT:
             continue
-        if len(steps) == image.frames > 1:  # from the first frame on, or from the frame before
-            steps = steps.cumsum() if len({*steps[1:]}) == 1 else steps
-            return [float(angle + step) for angle, step in zip(angles, steps, strict=True)]
-        return [float(angle) for angle in angles]
+        turn = np.array(angles, float)
+        if len(steps) == image.frames > 1:
+            wide = abs(steps[1:])
+            each = wide.max() < MAX_UNEVEN * wide.min()
+            turn += steps.cumsum() if each else steps
+        return turn.tolist()
     return []
 
 

@@ -45,6 +45,8 @@ EDF_TYPES = {
 }
 #: Exposure times in s by their names in EDF.
 EDF_TIMES = ("count_time", "ExposureTime", "acq_expo_time")
+#: The ring's current by its names in EDF beside counters.
+EDF_CURRENTS = ("machineCurrentStart", "machineCurrent", "machine_current")
 #: Parts of the detector, pixels that form one, and how the camera turned them, by their names in
 #: EDF.
 EDF_REGION = tuple(
@@ -63,6 +65,7 @@ EDF_KEYS = (
     Key("Dummy", "refused", "its pixels are bad: replace them, and give views.bad_pixels"),
     Key(", ".join(EDF_TIMES), "compared", "of views and flat fields, as ExposureTime, from s"),
     Key("counter_mne, counter_pos", "compared", "the ring's current srcur, as ExposureTime"),
+    Key(", ".join(EDF_CURRENTS), "compared", "as srcur, without that counter"),
     Key(", ".join((*EDF_REGION, "energy")), "compared", "of views and flat fields; warned of"),
     Key("title", "ignored", SAID),
     Key("optic_used, PSize_*", "ignored", "the pixel size is asked for"),
@@ -74,7 +77,7 @@ EDF_KEYS = (
     ),
     Key(
         "run, scan_*, acq_*, point_no, preset, dir, prefix, suffix, date, time, time_of_*, "
-        "machine*, cutoffenergy, fill_mode",
+        "machineMode, machineCurrentStop, machineCurrentUnit, cutoffenergy, fill_mode",
         "ignored",
         "of the scan",
     ),
@@ -215,7 +218,9 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
     times = {name: stated[name.lower()] for name in EDF_TIMES if stated.get(name.lower())}
     numbers = (number_of(text, f"{file}: {name}") for name, text in times.items())
     exposed = {f"{1000 * time:.6g}" for time in numbers if time is not None}
-    texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": counters.get("srcur", "")}
+    currents = [counters.get("srcur", ""), *(stated.get(name.lower(), "") for name in EDF_CURRENTS)]
+    current = next(filter(None, currents), "").split() or [""]
+    texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": current[0]}
     texts |= {name: stated.get(name, "") for name in (*EDF_REGION, "energy")}
     unknown = unknown_entries(stated, EDF_KEYS) + said([("title", stated.get("title", ""))])
     return kind, {name: [text] for name, text in texts.items() if text}, unknown

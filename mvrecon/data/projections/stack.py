@@ -24,6 +24,9 @@ from mvrecon.geometry.cameras.turning import MAX_ANGLE, apart, turned
 VIEWS = 2**16
 #: Relative difference of pixel sizes between a file and the cameras due to rounding.
 MAX_PITCH_DIFFERENCE = 1e-3
+#: Distances of the source from the detector, in mm, that files state; and their relative difference
+#: from the cameras' that is not warned of.
+DISTANCES, MAX_DISTANCE_DIFFERENCE = ("DistanceSourceToDetector", "RTImageSID"), 0.01
 #: Cosine from which the columns of all cameras are taken as parallel to the axis of their turn.
 ALONG = 0.99
 #: Name of the attenuation map of simulated counts, beside their views.h5.
@@ -197,9 +200,11 @@ class ProjectionStack(ABC):
             Refused: pixels of another size, or what a format adds.
 
         Warns:
-            UserWarning: cameras that turn about the rows' common normal by other angles.
+            UserWarning: cameras that turn about the rows' common normal by other angles, or at
+                another distance from the detector.
         """
         self._check_turn(cameras)
+        self._check_distance(cameras)
         if self.pixel_mm is None:
             return
         down, right = self.pixel_mm
@@ -230,6 +235,20 @@ class ProjectionStack(ABC):
                 f"{self.names[0]} to {self.names[k]}, got cameras that turn by {found:.1f}",
                 stacklevel=2,
             )
+
+    def _check_distance(self, cameras: Cameras) -> None:
+        for name in DISTANCES:
+            if cameras.parallel or (stated := self.exposure(name)) is None or not stated.all():
+                continue
+            normal = F.normalize(torch.linalg.cross(cameras.u, cameras.v), dim=-1)
+            got = ((cameras.origin - cameras.source) * normal).sum(dim=-1).abs().cpu().numpy()
+            k = int(np.abs(got / stated - 1).argmax())
+            if abs(got[k] / stated[k] - 1) > MAX_DISTANCE_DIFFERENCE:
+                warnings.warn(
+                    f"{self.path}: states a {name} of {stated[k]:g} mm for {self.names[k]}, got a "
+                    f"camera with {got[k]:g} mm from its source to the detector",
+                    stacklevel=2,
+                )
 
     @abstractmethod
     def _block(self, first: int, last: int) -> np.ndarray:

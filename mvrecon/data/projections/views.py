@@ -178,7 +178,11 @@ class MeasuredViews:
             self._kept(mean_field(self.stack, where, name, value, layout, exposure, used))
             for name, value in (("dark", self.options.dark), ("flat", self.options.flat))
         )
-        return fields(dark, flat, str(self.options.path), self.options.dead, self.saturation)
+        given = (
+            self.options.flat if self.options.flat is not None else self.stack.fields.get("flat")
+        )
+        saturation = math.inf if isinstance(given, int | float) else self.saturation
+        return fields(dark, flat, str(self.options.path), self.options.dead, saturation)
 
     @property
     def flips(self) -> tuple[bool, bool]:

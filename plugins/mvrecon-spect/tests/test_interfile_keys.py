@@ -242,6 +242,15 @@ def test_headers_of_projections_have_the_endings_of_several_programs(ending, tmp
         open_projections(path)
 
 
+def test_texts_that_state_what_was_done_to_counts_are_named(tmp_path):
+    """Not those of the study."""
+    read(tmp_path, VIEWS, "data description := rest, supine", "comment := 64 projections")
+    lines = ["comment := counts scaled by 1000", "data description := scatter corrected"]
+    for line in lines:
+        with pytest.warns(UserWarning, match=line.replace(" :=", ":")):
+            read(tmp_path, VIEWS, line)
+
+
 SCALES = {
     "none": ([], 1),
     "image scaling factor": (["image scaling factor[1] := 2"], 2),

@@ -348,12 +348,28 @@ def test_derived_images_are_named_unless_compressed(text, code, expected, tmp_pa
     assert open_projections(views(tmp_path, **tags)).unknown == expected * COUNT
 
 
+@pytest.mark.parametrize(("name", "warned"), [("DistanceSourceToDetector", True), (None, False)])
+def test_the_distance_of_source_and_detector_is_compared_with_the_cameras(name, warned, tmp_path):
+    """As `RTImageSID` is; of detectors that are tilted, it is the perpendicular one."""
+    stack = open_projections(views(tmp_path, **({} if name is None else {name: 1200.0})))
+    detector = {"pixels": (6, 8), "pixel_mm": (1.0, 1.0)}
+    for sdd in (1200.0, 1195.0, 1000.0):
+        rig = {"name": "circular", "n_views": COUNT, "sid": 800.0, "sdd": sdd, "detector": detector}
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            stack.check_rig(CAMERAS.from_config(rig))
+        expected = ["1200 mm for 0, got a camera with 1000"] * (warned and sdd == 1000)
+        assert len(caught) == len(expected)
+        assert all(text in str(one.message) for one, text in zip(caught, expected, strict=True))
+
+
 #: Angles of views by how a file states them: of each image, or from the first frame on, or from the
 #: frame before.
 TURNS = {
     "images": ([0.0, 10.0, 20.0, 30.0], None),
     "from the first": (-15.0, [0.0, 10.0, 20.0, 30.0]),
     "from the frame before": (-15.0, [0.0, 10.0, 10.0, 10.0]),
+    "from the frame before, measured": (-15.0, [0.0, 10.05, 9.98, 9.98]),
     "clockwise, across 0": ([15.0, 5.0, 355.0, 345.0], None),
     "uneven": (0.0, [0.0, 10.5, 19.6, 30.2]),
 }
@@ -390,14 +406,14 @@ def test_angles_are_compared_with_the_turn_of_the_cameras(case, beam, tmp_path):
     assert re.search(r"turn by 30\.[02] degrees from .*, got cameras that turn by 36\.0", message)
 
 
-@pytest.mark.parametrize("secondary", [None, 0.0, 20.0])
+@pytest.mark.parametrize("secondary", [None, 0.0, 0.5, 20.0])
 def test_angles_that_cannot_be_compared_are_not(secondary, tmp_path):
     """With a secondary angle; and equal angles."""
     tags = {} if secondary is None else {"PositionerSecondaryAngle": secondary}
     angles = open_projections(
         views(tmp_path, lambda dataset, k: setattr(dataset, PRIMARY, 10.0 * k), **tags)
     ).angles
-    assert list(angles) == ([] if secondary else [0.0, 10.0, 20.0, 30.0])
+    assert list(angles) == ([] if secondary == 20 else [0.0, 10.0, 20.0, 30.0])
     rest = open_projections(views(tmp_path, **{PRIMARY: 30.0}))
     options = {"n_views": COUNT, "sid": 800.0, "sdd": 1200.0, "name": "circular"}
     detector = {"pixels": (6, 8), "pixel_mm": (1.0, 1.0)}

@@ -193,7 +193,9 @@ def test_unknown_entries_are_warned_of(tmp_path):
 
 
 def test_entries_of_ctpro_count_as_those_of_the_scan(tmp_path):
-    """Those of how images were taken: shuttling is refused, and a file of angles named."""
+    """Those of how images were taken: shuttling is refused, and a file of angles named. Others are
+    named if they would count in the scan's own section, and say something else.
+    """
     path = xtekct(tmp_path, Shuttling=None)
     own = path.read_text("latin-1")
     path.write_text(f"{own}Shuttling=True\r\n", "latin-1")
@@ -209,6 +211,15 @@ def test_entries_of_ctpro_count_as_those_of_the_scan(tmp_path):
         (tmp_path / "a.ang").write_text("".join(f"{k}: {k * step}\n" for k in range(9)))
         path.write_text(f"{own}AngleFile_Use=True\r\n", "latin-1")
         nikon.read(path)  # its steps are compared
+        path.write_text(
+            f"{own}AngularStep={nikon.header(path).texts['angularstep']}\r\n", "latin-1"
+        )
+        nikon.read(path)
+    for entry in ("FluxNormalisation=True", "AngularStep=-30", "CentreOfRotationTop=3.0"):
+        path.write_text(f"{own}{entry}\r\n", "latin-1")
+        name = entry.partition("=")[0].lower()
+        with pytest.warns(UserWarning, match=rf"know: \[ctpro\] {name};"):
+            nikon.read(path)
 
 
 def test_entries_of_sections_that_no_reader_knows_are_named(tmp_path):

@@ -238,6 +238,7 @@ EXPOSURES = {
         "srcur",
         [{"counter_mne": "mon srcur", "counter_pos": f"7 {i}"} for i in (200, 100, 100)],
     ),
+    "machineCurrent": ("srcur", [{"machineCurrent": f"{i} mA"} for i in (200, 100, 100)]),
 }
 
 

@@ -163,3 +163,18 @@ def test_a_white_level_of_nikon_is_the_flat_field_of_other_views(scan, tmp_path)
     images(tmp_path / "nikon", grey(body=BODY + 0.4), "tooth_{}.tif")
     found = opened(scan, dark=DARK, flat=str(path), find_bad_pixels=False).whole().views
     assert np.abs(found.numpy() - BODY).max() < 1e-3
+
+
+@pytest.mark.parametrize("top", [65_535.0, 65_534.0, 30_000.0])
+def test_a_flat_field_that_is_given_as_a_number_is_not_saturated(top, tmp_path):
+    """The largest number that pixels hold, as the unattenuated beam in .hnc; a measured flat field
+    of this grey value is.
+    """
+    views = np.full((3, 6, 8), top / 2).astype("u2")
+    np.save(tmp_path / "a.npy", views)
+    measured = opened(tmp_path / "a.npy", flat=top, find_bad_pixels=False).whole()
+    expected = -np.log(views[0] / np.float32(top))
+    np.testing.assert_allclose(measured.views[0], expected, rtol=1e-5)
+    np.save(tmp_path / "flat.npy", np.full((6, 8), 65_535, "u2"))
+    with pytest.raises(Refused, match="between dark and saturated"):
+        opened(tmp_path / "a.npy", flat=str(tmp_path / "flat.npy"), find_bad_pixels=False)

@@ -83,8 +83,12 @@ KEYS = (
 LISTED, MAX_STEP_DIFFERENCE = re.compile(r"\s*(\d+)[\s:]+([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\b"), 0.1
 #: Entries of the section CTPro that count as those of XTekCT.
 CTPRO = ("shuttling", "anglefile_use")
-#: Sections of the tube, of Nikon's own reconstruction and of texts.
+#: Sections of the tube, of Nikon's own reconstruction and of texts; entries in these that would
+#: count in XTekCT are named, unless they repeat it.
 OTHER_SECTIONS = ("[ctpro]", "[xrays]", "[dicom]")
+
+
+USED = {n.lower() for key in KEYS if key.use in ("applied", "refused") for n in key.names}
 
 
 class Header(NamedTuple):
@@ -126,13 +130,15 @@ def header(path: str | Path) -> Header:
         own = section == "[xtekct]" or (section == "[ctpro]" and name in CTPRO)
         if own and texts.setdefault(name, value) != value:
             raise Refused(f"{path}: expected one {name}, got {texts[name]} and {value}")
-        if not own and section not in OTHER_SECTIONS:
+        if not own and (section not in OTHER_SECTIONS or name in USED):
             others[f"{section} {name}"] = value
     if not texts:
         raise Refused(f"{path}: expected a section [XTekCT] of Nikon's, got none")
     check_keys(path, KEYS, lambda key: _either(texts, key))
     if _angle_files(path):
         texts.pop("anglefile_use", None)  # they are compared
+    repeated = {name for name, value in others.items() if texts.get(name.split()[-1]) == value}
+    others = {name: value for name, value in others.items() if name not in repeated}
     warn_of_unknown(path, [*unknown_entries(texts, KEYS), *unknown_entries(others, ())])
     return Header(path, texts)
 

@@ -20,6 +20,7 @@ import numpy as np
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_beside, plain_name, shown, text_of
 from mvrecon.core.files.keys import Key, check_keys, check_unknown
+from mvrecon.core.files.prose import said
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.formats.common import number
 from mvrecon_spect.files.interfile_keys import (
@@ -29,6 +30,7 @@ from mvrecon_spect.files.interfile_keys import (
     KEYS,
     SECTIONS,
     SPELLINGS,
+    TEXTS,
     Content,
 )
 
@@ -170,7 +172,8 @@ def read_header(path: str | Path, content: Content) -> Header:
         if _used(name, table) or EFFECT.search(str(name)):
             raise Refused(f"{path}: expected '{name} := value', got {shown(line)}")
         unknown += [(str(name), line)] * (name.base not in table)
-    check_unknown(path, unknown, (*KEYS, *CONTENT[content]), EFFECTS)
+    texts = [(name.base, value) for name, value in pairs if name.base in TEXTS]
+    check_unknown(path, unknown, (*KEYS, *CONTENT[content]), EFFECTS, said(texts))
     return Header(path, values)
 
 

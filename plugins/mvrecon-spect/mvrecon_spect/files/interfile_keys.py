@@ -20,6 +20,8 @@ def _axes(name: str, count: int = 3) -> str:
 
 
 NO = ("n", "no", "none", "0")
+#: Keys of free texts.
+TEXTS = ("data description", "label", "comment", "comments")
 #: Keys of a header of any content. Names with and without [1] have one meaning; an index that is
 #: not listed is refused, except of ignored keys without any.
 KEYS = (
@@ -105,14 +107,15 @@ KEYS = (
     ),
     Key(
         "date of keys, conversion program, program author, program version, program date, "
-        "original institution, contact person, data description, label, comment, "
-        "comments, date last processed, time last processed, archive status, "
-        "patient name, patient id, patient dob, patient sex, patient age, patient height, "
-        "patient weight, study id, study date, study time, study description, exam type, "
-        "process label, sms-mi version number, sms-mi header name space, bucket singles rate",
+        "original institution, contact person, date last processed, time last processed, "
+        "archive status, patient name, patient id, patient dob, patient sex, patient age, "
+        "patient height, patient weight, study id, study date, study time, study description, "
+        "exam type, process label, sms-mi version number, sms-mi header name space, "
+        "bucket singles rate",
         "ignored",
         "origin",
     ),
+    Key(", ".join(TEXTS), "ignored", keys.SAID),
     Key(
         "isotope, isotope name, isotope gamma halflife (sec), radionuclide, radionuclide name, "
         "radionuclide halflife (sec), radiopharmaceutical, dosage, collimator, collimator name, "
