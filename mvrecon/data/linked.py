@@ -276,6 +276,11 @@ def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
     return found
 
 
+def units_at(places: Sequence[Place]) -> dict[Place, str]:
+    """The unit that each data set states by an attribute of `UNITS`, where there is one."""
+    return {place: text for name in UNITS[::-1] for place, text in texts_at(places, name).items()}
+
+
 def units_of(places: Sequence[Place], names: Sequence[str] = UNITS) -> str:
     """The units that data sets state by attributes of these names, several joined by " or "; empty
     without one.

@@ -14,6 +14,7 @@ import numpy as np
 from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
 from mvrecon.core.files.keys import IMAGE_EFFECTS, unknown_names
 from mvrecon.data.linked import (
+    UNITS,
     VIEW_AXES,
     MissingFile,
     Place,
@@ -24,6 +25,7 @@ from mvrecon.data.linked import (
     groups,
     listing,
     texts_at,
+    units_at,
     unknown_around,
     values_at,
 )
@@ -39,6 +41,7 @@ from mvrecon.data.projections.nexus_detector import (
     INVALID,
     VIEW,
     first,
+    limits_in,
     limits_of,
     of_frames,
     there,
@@ -56,6 +59,8 @@ FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
 #: Words of fields beside the frames by the values of these that change nothing; of others it is 0.
 FIELD_EFFECTS = {**IMAGE_EFFECTS, "binning": 1}
+#: Keys that do not count, wherever they stand, or that are read wherever they do.
+IDLE = [key for key in KEYS if key.use == "ignored" or key in nexus_axes.KEYS]
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Pixels by which a sample may move between views.
@@ -155,6 +160,7 @@ class _Layout(NamedTuple):
     flats: Sequence[tuple[str, Place]] = ()  # exposures of flat fields beside the frames
     moves: Sequence[Place] = ()
     names: Sequence[Place] = ()  # of the frames: in these groups are the keys beside them
+    used: Sequence[Place] = ()  # what the layout found, beside the frames too
 
     @property
     def axes(self) -> tuple[str, str, str]:
@@ -198,7 +204,8 @@ class _Layout(NamedTuple):
         elif one not in known:
             layout = layout._replace(angles=None)
         if sinogram:  # what is stated of frames is not of rows
-            layout = layout._replace(sinogram=True, exposures=(), moves=())
+            layout = layout._replace(sinogram=True, exposures=())
+        layout = layout._replace(used=layout._found())
         for place in names[one]:  # NXdata may scale what it links to, or state its axes
             check_around(place)
         for group, own in _groups(names[one]).items():
@@ -223,7 +230,16 @@ class _Layout(NamedTuple):
                     f"views.flip_{option}=true so is the volume",
                     stacklevel=2,
                 )
-        nexus_axes.warn_of_turned(beside)
+        moves = [
+            *nexus_axes.warn_of_turned(beside),
+            *nexus_axes.translations(
+                stage
+                for group in above
+                for stage in nexus_axes.transformations_in(
+                    group._replace(name=f"{group.name}/sample")
+                )
+            ),
+        ]
         instrument = first(above, "instrument", find=there)
         shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in _members(instrument)]
         sizes = [
@@ -250,8 +266,10 @@ class _Layout(NamedTuple):
             moves=[
                 place
                 for axis in "xyz"
-                if (place := first(above, f"sample/{axis}_translation")) is not None
-            ],
+                for where, name in ((above, "sample/"), (beside, ""))
+                if (place := first(where, f"{name}{axis}_translation")) is not None
+            ]
+            + moves,
             names=names,
         )
 
@@ -286,12 +304,12 @@ class _Layout(NamedTuple):
         keys = self._keys(frames.shape[0])
         lengths = [place for pair in self.pixel for place in pair]
         monitors = [place for _, place in (*self.exposures, *self.flats)]
-        units = texts_at([*lengths, *monitors], "units")
+        units = units_at([*lengths, *monitors])
         stated = {n: of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
         angles = [] if self.angles is None else [self.angles]
         below = [stage for place in angles for stage in nexus_axes.translations_below(place)]
         unknown = [
-            *self._unknown_fields(below),
+            *self._unknown_fields(below, frames.parts, field),
             *(name for place in angles for name in unknown_around(place)),
         ]
         fields: dict[str, ProjectionStack] = {
@@ -305,7 +323,10 @@ class _Layout(NamedTuple):
             of_flats = {
                 n: of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
             }
-            fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats)
+            beside = self._replace(names=[place], angles=None)._unknown_fields(
+                (), others.parts, name
+            )
+            fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats, unknown=beside)
         if field in fields:
             return fields[field]
         if field is None and texts_at([self.frames], "MATLAB_class"):
@@ -343,17 +364,42 @@ class _Layout(NamedTuple):
             moves=(),
         )
 
-    def _unknown_fields(self, below: Sequence[Place]) -> list[str]:
-        """Data sets beside the frames and beside the angles that no key knows, but those on which
-        the angles depend.
+    def _found(self) -> list[Place]:
+        """The data sets that the layout uses, or that do not count beside those."""
+        beside = [*_groups(self.names)]
+        keys = [first(beside, name) for name in ("image_key_control", "image_key")]
+        flips = [first(beside, f"{axis}_flipped", find=there) for axis in "xy"]
+        found = [
+            *(place for place in (*(keys if self.key else ()), *flips) if place is not None),
+            *(place for pair in self.pixel for place in pair),
+            *(place for _, place in (*self.fields, *self.exposures, *self.flats)),
+            *([] if self.sinogram else limits_in(beside).values()),
+        ]
+        return [*self.moves, *found, *([] if self.angles is None else [self.angles])]
+
+    def _unknown_fields(
+        self, below: Sequence[Place], parts: Sequence[Place], field: str | None
+    ) -> list[str]:
+        """Data sets beside the frames, their parts and the angles that no key knows, but those on
+        which the angles depend; and of views those beside the frames, and beside parts if they have
+        no such name, that a key knows and that are not used.
         """
-        names = _groups([*self.names, *([] if self.angles is None else [self.angles])])
+        angles = [] if self.angles is None else [self.angles]
+        own, others = _groups(self.names), _groups(parts)
+        names = own | others | _groups(angles)
+        used = {*map(address, (*self.names, *self.used, *angles))}
+        restated = {place.name.rpartition("/")[2] for place in (*self.used, *angles, *below)}
         found: list[str] = []
-        for place in names:
-            with opened(place.path) as file:
-                found += fields_in(file[place.name], FIELD_EFFECTS)
-        known = {*names.values(), *(place.name.rpartition("/")[2] for place in below)}
-        return [name for name in unknown_names(found, KEYS) if name not in known]
+        for group in names:
+            with opened(group.path) as file:
+                fields = fields_in(file[group.name], FIELD_EFFECTS)
+            unknown = unknown_names(fields, KEYS if field or group not in {*own, *others} else IDLE)
+            for name in unknown:
+                place = there(group.path, f"{group.name}/{name}")
+                known = name in restated if group not in own else False
+                if not known and (place is None or address(place) not in used):
+                    found.append(name)
+        return [name for name in dict.fromkeys(found) if name not in names.values()]
 
     def _keys(self, count: int) -> np.ndarray:
         """The image_key of each of so many frames; all are views without one."""
@@ -376,18 +422,20 @@ class _Layout(NamedTuple):
     def _warn_of_moves(
         self, keys: np.ndarray, pixel: tuple[float, float] | None, below: Sequence[Place]
     ) -> None:
-        """Warn of translations of the sample between views, by more than a part of a pixel."""
+        """Warn of translations of the sample or the detector between views, by more than a part of
+        a pixel.
+        """
         for place in dict.fromkeys((*self.moves, *below)):
-            moved = values_at(place, ("units", *nexus_axes.ATTRIBUTES)).ravel()
-            views = moved[keys == VIEW] if len(moved) == len(keys) else moved[:0]
-            far = np.ptp(views) if len(views) else 0
-            unit = texts_at([place], "units").get(place)
+            moved = values_at(place, (*UNITS, *nexus_axes.ATTRIBUTES)).ravel()
+            far = np.ptp(moved[keys == VIEW] if len(moved) == len(keys) else moved)
+            unit = units_at([place]).get(place)
             if far and not (
                 pixel and unit and far * millimetres(place, unit) < MAX_MOVE_PX * min(pixel)
             ):
                 warnings.warn(
                     f"{place}: the sample moved by {far:g}{f' {unit}' if unit else ''} between "
-                    f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
+                    f"views, in relation to the detector, which the rig does not follow; "
+                    f"calibrate=[shifts] fits shifts",
                     stacklevel=3,
                 )
 
@@ -396,7 +444,7 @@ class _Layout(NamedTuple):
         for pair in self.pixel:
             sizes = []
             for place in pair:
-                values = np.unique(values_at(place, ("units",)))
+                values = np.unique(values_at(place, UNITS))
                 if not (unit := units.get(place)):
                     warnings.warn(f"{place}: has no units, and is not used", stacklevel=2)
                 elif len(values) == 1 and values[0] > 0:

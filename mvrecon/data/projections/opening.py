@@ -16,7 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.files.keys import warn_of_unknown
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file, same
-from mvrecon.data.linked import Place, followed, listing, values_at
+from mvrecon.data.linked import UNITS, Place, followed, listing, values_at
 from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, in_field, view_files
@@ -157,7 +157,7 @@ def exposures(
     if names := exposure_names(stack, path):
         values = relative_exposure(stack, _field(stack, where, "flat", flat, layout), names)
     elif place := _place_in(stack, path) or in_another(path):
-        values = np.ravel(values_at(place, ("units",))).astype(float)
+        values = np.ravel(values_at(place, UNITS)).astype(float)
     else:
         try:
             values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES)[1])
