@@ -4,7 +4,7 @@
 
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,10 +23,14 @@ from mvrecon.data.linked import (
     check_order,
     followed,
     groups,
+    groups_above,
+    groups_of,
     listing,
+    members,
     texts_at,
     units_at,
     unknown_around,
+    unknown_attributes,
     values_at,
 )
 from mvrecon.data.projections import exposures, nexus_axes
@@ -205,10 +209,13 @@ class _Layout(NamedTuple):
             layout = layout._replace(angles=None)
         if sinogram:  # what is stated of frames is not of rows
             layout = layout._replace(sinogram=True, exposures=())
+        other = layout.key is not None and _size(layout.key) != _count(layout.frames)
+        if dataset is not None and other:  # such as of the frames that these were made of
+            layout = layout._replace(key=None)
         layout = layout._replace(used=layout._found())
         for place in names[one]:  # NXdata may scale what it links to, or state its axes
             check_around(place)
-        for group, own in _groups(names[one]).items():
+        for group, own in groups_of(names[one]).items():
             if texts_at([group], "signal").get(group, own) == own:
                 check_order(group, layout.axes, FRAMES)
         return layout
@@ -216,8 +223,8 @@ class _Layout(NamedTuple):
     @classmethod
     def _tomo(cls, names: Sequence[Place]) -> "_Layout":
         """The layout of NXtomo, by the names of the frames."""
-        beside = [*_groups(names)]
-        above = [outer for group in beside for outer in _outer(group)]
+        beside = [*groups_of(names)]
+        above = [outer for group in beside for outer in groups_above(group)]
         frames = names[0]
         source = first(above, "instrument/source/type", "source/type")
         kind = None if source is None else texts_at([source], "").get(source)
@@ -241,7 +248,7 @@ class _Layout(NamedTuple):
             ),
         ]
         instrument = first(above, "instrument", find=there)
-        shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in _members(instrument)]
+        shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in members(instrument)]
         sizes = [
             [first(above, f"sample/{axis}_pixel_size"), first(beside, f"{axis}_pixel_size")]
             for axis in "yx"
@@ -308,9 +315,12 @@ class _Layout(NamedTuple):
         stated = {n: of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
         angles = [] if self.angles is None else [self.angles]
         below = [stage for place in angles for stage in nexus_axes.translations_below(place)]
+        near = {} if self.sinogram or field is not None else limits_in([*groups_of(self.names)])
+        marks = [place for place in (self.key, near.get("pixel_mask")) if place is not None]
         unknown = [
             *self._unknown_fields(below, frames.parts, field),
             *(name for place in angles for name in unknown_around(place)),
+            *(name for place in marks for name in unknown_attributes(place)),
         ]
         fields: dict[str, ProjectionStack] = {
             name: FrameViews(frames, np.flatnonzero(keys == key), stated=stated, unknown=unknown)
@@ -319,6 +329,8 @@ class _Layout(NamedTuple):
         }
         for name, place in self.fields:
             others = Frames(place, folder)
+            if not self.sinogram:  # else in either order, by its size
+                check_order(place, VIEW_AXES, FRAMES)
             kind = np.full(others.shape[0], FLAT)
             of_flats = {
                 n: of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
@@ -343,7 +355,7 @@ class _Layout(NamedTuple):
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
         self._warn_of_moves(keys, pixel, below)
-        limits = limits_of([] if self.sinogram else [*_groups(self.names)], frames, keys)
+        limits = limits_of(near, frames, keys)
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
 
     def of_field(self, folder: Path) -> "_Layout":
@@ -351,22 +363,17 @@ class _Layout(NamedTuple):
         stands beside them for another number of frames, such as views.
         """
         count = Frames(self.frames, folder).shape[0]
-
-        def fits(place: Place) -> bool:
-            with opened(place.path) as file:
-                return getattr(file[place.name], "size", 0) in (1, count)
-
         return self._replace(
-            key=self.key if self.key and fits(self.key) else None,
+            key=self.key if self.key and _size(self.key) == count else None,
             angles=None,
             pixel=(),
-            exposures=[one for one in self.exposures if fits(one[1])],
+            exposures=[one for one in self.exposures if _size(one[1]) in (1, count)],
             moves=(),
         )
 
     def _found(self) -> list[Place]:
         """The data sets that the layout uses, or that do not count beside those."""
-        beside = [*_groups(self.names)]
+        beside = [*groups_of(self.names)]
         keys = [first(beside, name) for name in ("image_key_control", "image_key")]
         flips = [first(beside, f"{axis}_flipped", find=there) for axis in "xy"]
         found = [
@@ -385,8 +392,8 @@ class _Layout(NamedTuple):
         no such name, that a key knows and that are not used.
         """
         angles = [] if self.angles is None else [self.angles]
-        own, others = _groups(self.names), _groups(parts)
-        names = own | others | _groups(angles)
+        own, others = groups_of(self.names), groups_of(parts)
+        names = own | others | groups_of(angles)
         used = {*map(address, (*self.names, *self.used, *angles))}
         restated = {place.name.rpartition("/")[2] for place in (*self.used, *angles, *below)}
         found: list[str] = []
@@ -456,28 +463,17 @@ class _Layout(NamedTuple):
         return None
 
 
-def _groups(names: Sequence[Place]) -> dict[Place, str]:
-    """The groups in which data sets are, also by the links to them, with their names there."""
-    found: dict[Place, str] = {}
-    for place in names:
-        for path, name, _ in (*place.links, place):
-            group, _, own = name.rpartition("/")
-            found.setdefault(Place(path, group or "/"), own)
-    return found
+def _size(place: Place) -> int:
+    """The number of values of a data set; 0 of a group."""
+    with opened(place.path) as file:
+        return getattr(file[place.name], "size", 0)
 
 
-def _outer(group: Place) -> Iterator[Place]:
-    """A group and those that it is in, up to the file's root."""
-    parts = group.name.strip("/").split("/")
-    return (Place(group.path, "/" + "/".join(parts[:k])) for k in range(len(parts), -1, -1))
-
-
-def _members(group: Place | None) -> list[str]:
-    """Names of the members of a group; none of what is no group."""
-    if group is None:
-        return []
-    with opened(group.path) as file:
-        return [*found] if isinstance(found := file[group.name], h5py.Group) else []
+def _count(frames: Place) -> int:
+    """The number of frames [m v u], or of the one [v u], of a data set; 0 of others."""
+    with opened(frames.path) as file:
+        shape = getattr(file[frames.name], "shape", None) or ()
+    return shape[0] if len(shape) == 3 else 1
 
 
 def _flat_time(path: Path) -> Place | None:

@@ -5,7 +5,7 @@ and greatest grey value (Könnecke and others, J. Appl. Cryst. 48, 2015).
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -125,26 +125,25 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
 
 
 def limits_in(groups: Sequence[Place]) -> dict[str, Place]:
-    """What `limits_of` reads in groups, by name."""
+    """What `limits_of` reads in groups, such as that of the detector, by name."""
     found = {name: first(groups, name, find=there) for name in (*LIMITS, *NUMBERS)}
     return {name: place for name, place in found.items() if place is not None}
 
 
 def limits_of(
-    groups: Sequence[Place], frames: Frames, keys: np.ndarray
+    places: Mapping[str, Place], frames: Frames, keys: np.ndarray
 ) -> tuple[np.ndarray | None, float | None]:
     """Pixels that the detector's mask marks as bad, and its greatest grey value; None of what
     it does not state. Compares the order of the frames.
 
     Args:
-        groups: groups in which the frames are, such as that of the detector.
+        places: what stands beside the frames, see `limits_in`.
         frames: all frames of the file.
         keys: image_key of each frame.
 
     Warns:
         UserWarning: a mask of another size, other values than one number, an underload.
     """
-    places = limits_in(groups)
     if (place := places.get("sequence_number")) is not None:
         _check_sequence(place, keys)
     numbers = {name: _number(places[name]) for name in NUMBERS if name in places}
