@@ -45,6 +45,7 @@ from mvrecon.data.projections.nexus_detector import (
     INVALID,
     VIEW,
     first,
+    kinds_in,
     limits_in,
     limits_of,
     of_frames,
@@ -164,6 +165,7 @@ class _Layout(NamedTuple):
     flats: Sequence[tuple[str, Place]] = ()  # exposures of flat fields beside the frames
     moves: Sequence[Place] = ()
     names: Sequence[Place] = ()  # of the frames: in these groups are the keys beside them
+    others: Sequence[str] = ()  # monitors and beams of other names than those that are read
     used: Sequence[Place] = ()  # what the layout found, beside the frames too
 
     @property
@@ -224,9 +226,13 @@ class _Layout(NamedTuple):
     def _tomo(cls, names: Sequence[Place]) -> "_Layout":
         """The layout of NXtomo, by the names of the frames."""
         beside = [*groups_of(names)]
-        above = [outer for group in beside for outer in groups_above(group)]
-        frames = names[0]
-        source = first(above, "instrument/source/type", "source/type")
+        exchange = [Place(path, "/measurement") for path in dict.fromkeys(g.path for g in beside)]
+        above = [*(outer for group in beside for outer in groups_above(group)), *exchange]
+        detectors = [*beside, *(g._replace(name=f"{g.name}/instrument/detector") for g in exchange)]
+        frames, instrument = names[0], first(above, "instrument", find=there)
+        kinds = {} if instrument is None else kinds_in([*groups_above(instrument)][:2])
+        sources = [group for group, kind in kinds.items() if kind == "NXsource"]
+        source = first(above, "instrument/source/type", "source/type") or first(sources, "type")
         kind = None if source is None else texts_at([source], "").get(source)
         parallel = kind is None or PARALLEL.search(kind)
         for axis, option in (("x", "columns"), ("y", "rows")):
@@ -247,7 +253,6 @@ class _Layout(NamedTuple):
                 )
             ),
         ]
-        instrument = first(above, "instrument", find=there)
         shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in members(instrument)]
         sizes = [
             [first(above, f"sample/{axis}_pixel_size"), first(beside, f"{axis}_pixel_size")]
@@ -264,7 +269,7 @@ class _Layout(NamedTuple):
             exposures=[
                 (name, place)
                 for where, those in (
-                    (beside, (*exposures.DETECTOR, *DETECTOR_BEAM)),
+                    (detectors, (*exposures.DETECTOR, *DETECTOR_BEAM)),
                     (above, (*exposures.MONITORS, *shares, *BEAM)),
                 )
                 for name in those
@@ -278,6 +283,12 @@ class _Layout(NamedTuple):
             ]
             + moves,
             names=names,
+            others=[
+                name
+                for group, kind in kinds.items()
+                if kind in ("NXmonitor", "NXbeam")
+                and (name := group.name.rpartition("/")[2]) not in ("control", "beam")
+            ],
         )
 
     def _exchange(self, path: Path, sinogram: bool) -> "_Layout":
@@ -294,13 +305,13 @@ class _Layout(NamedTuple):
             for name in ("data_white", "data_dark", "theta")
         }
         kept = [("flat", places["data_white"]), ("dark", places["data_dark"])]
-        times = [there(path, "/measurement/instrument/detector/exposure_time"), _flat_time(path)]
-        stated = [[(exposures.EXCHANGE, time)] if time is not None else [] for time in times]
+        flats = {name: place for name, place in self.exposures if _size(place) == 1}
+        if (time := _flat_time(path)) is not None:
+            flats[exposures.EXCHANGE] = time
         return self._replace(
             angles=places["theta"] or self.angles,
             fields=[(n, p) for n, p in kept if p is not None],
-            exposures=[*self.exposures, *stated[0]],
-            flats=stated[1] or stated[0],
+            flats=[*flats.items()],
         )
 
     def opened(self, scan: Path, field: str | None = None) -> ProjectionStack:
@@ -319,6 +330,7 @@ class _Layout(NamedTuple):
         marks = [place for place in (self.key, near.get("pixel_mask")) if place is not None]
         unknown = [
             *self._unknown_fields(below, frames.parts, field),
+            *self.others,
             *(name for place in angles for name in unknown_around(place)),
             *(name for place in marks for name in unknown_attributes(place)),
         ]

@@ -12,7 +12,7 @@ import numpy as np
 
 from mvrecon.core.files.checks import Refused, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.linked import UNITS, MissingFile, Place, followed, texts_at, values_at
+from mvrecon.data.linked import UNITS, MissingFile, Place, followed, members, texts_at, values_at
 from mvrecon.data.projections import exposures
 from mvrecon.data.projections.exposures import unneeded
 from mvrecon.data.projections.frames import Frames
@@ -30,6 +30,7 @@ DETECTOR_BEAM = (
 BEAM = (
     *("instrument/beam/incident_energy", "instrument/beam/incident_wavelength"),
     *("instrument/monochromator/energy", "instrument/source/voltage"),
+    *("beam/incident_energy", "beam/incident_wavelength"),
 )
 #: Data sets of each pixel and of each frame of a detector, and single numbers.
 LIMITS = ("pixel_mask", "sequence_number")
@@ -122,6 +123,14 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
         values = exposures.in_base_units(values, name, unit, place)
     end = f" {unit}".rstrip() if beam else ""
     return [f"{x:.12g}{end}" if np.isfinite(x) else "" for x in values]
+
+
+def kinds_in(groups: Sequence[Place]) -> dict[Place, str]:
+    """The members of groups that are groups of NeXus, also by links, with their classes."""
+    found = [
+        there(group.path, f"{group.name}/{name}") for group in groups for name in members(group)
+    ]
+    return texts_at([place for place in found if place is not None], "NX_class")
 
 
 def limits_in(groups: Sequence[Place]) -> dict[str, Place]:

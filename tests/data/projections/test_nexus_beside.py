@@ -101,3 +101,56 @@ def test_a_sample_that_moves_between_the_angles_of_sinograms_is_warned_of(tmp_pa
         file["raw"], file["sample/x_translation"] = grey().swapaxes(0, 1), np.arange(VIEWS)
     with pytest.warns(UserWarning, match="x_translation: the sample moved by 11 between"):
         opened(tmp_path / "a.h5", dataset="raw", layout="sinogram", **GIVEN)
+
+
+@pytest.mark.parametrize("name", ["instrument/tube", "instrument/source", "xray_tube"])
+def test_a_source_of_any_name_counts_by_its_class(name, tmp_path):
+    path = tomo(tmp_path / "a.nxs", **{f"{name}/type": "Fixed Tube X-ray"})
+    with h5py.File(path, "a") as file:
+        file[f"entry/{name}"].attrs["NX_class"] = "NXsource"
+    assert opened(path).stack.rig["name"] is None
+
+
+@pytest.mark.parametrize("kind", ["NXmonitor", "NXbeam"])
+@pytest.mark.parametrize("name", ["instrument/ionc", "ionc", "control", "beam"])
+def test_monitors_and_beams_of_other_names_are_named(name, kind, tmp_path):
+    path = tomo(tmp_path / "a.nxs", **{f"{name}/distance": 1.0})
+    with h5py.File(path, "a") as file:
+        file[f"entry/{name}"].attrs["NX_class"] = np.bytes_(kind)
+    assert named(path) == (["ionc"] if name.endswith("ionc") else [])
+
+
+BEAMS = {
+    "beam/incident_energy": (20.0, 30.0, tomo),
+    "../measurement/instrument/monochromator/energy": (20.0, 30.0, exchange),
+    "../measurement/instrument/attenuator/attenuator_transmission": (1.0, 0.5, exchange),
+    "../measurement/instrument/source/current": (200.0, 100.0, exchange),
+    "../measurement/instrument/detector/gain_setting": ("low", "high", exchange),
+    "../measurement/instrument/detector/count_time": (0.1, 0.2, exchange),
+}
+
+
+@pytest.mark.parametrize("alike", [True, False])
+@pytest.mark.parametrize("name", BEAMS)
+def test_a_flat_field_of_another_beam_is_warned_of(name, alike, tmp_path):
+    """Of nxtomo's beam, and of Data Exchange's instrument."""
+    own, other, write = BEAMS[name]
+    paths = [write(tmp_path / "a.h5"), write(tmp_path / "air.h5")]
+    for path, value in zip(paths, (own, own if alike else other), strict=True):
+        with h5py.File(path, "a") as file:
+            file["entry" if write is tomo else "exchange"][name.replace("../", "/")] = value
+    if alike:
+        assert named(paths[0], flat=str(paths[1])) == []
+        return
+    last = name.rpartition("/")[2]
+    with pytest.warns(UserWarning, match=f"the flat field has the ([a-z/]*/)?{last} "):
+        opened(paths[0], flat=str(paths[1]), find_bad_pixels=False)
+
+
+def test_a_tube_and_a_moved_sample_of_data_exchange_count(tmp_path):
+    path = exchange(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        file["measurement/instrument/source/type"] = "X-ray tube"
+        file["measurement/sample/x_translation"] = np.arange(VIEWS)
+    with pytest.warns(UserWarning, match="x_translation: the sample moved by 11"):
+        assert opened(path, find_bad_pixels=False).stack.rig["name"] is None
