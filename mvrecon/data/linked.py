@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -397,8 +398,9 @@ def _scales(place: Place) -> list[tuple[str, int, str]]:
                     continue
                 name = scale.name.rpartition("/")[2].lower()
                 for target, axis in np.ravel(scale.attrs[REFERENCES]).tolist():
-                    if target and file[target] == own:
-                        found.append((name, int(axis), "dimension scales"))
+                    with suppress(KeyError, ValueError):  # data sets that were deleted
+                        if file[target] == own:
+                            found.append((name, int(axis), "dimension scales"))
     return found
 
 
