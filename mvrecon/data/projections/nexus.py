@@ -253,6 +253,7 @@ class _Layout(NamedTuple):
                 )
             ),
         ]
+        entries = [group for group in above if group.name.rpartition("/")[2] != "instrument"]
         shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in members(instrument)]
         sizes = [
             [first(above, f"sample/{axis}_pixel_size"), first(beside, f"{axis}_pixel_size")]
@@ -270,7 +271,7 @@ class _Layout(NamedTuple):
                 (name, place)
                 for where, those in (
                     (detectors, (*exposures.DETECTOR, *DETECTOR_BEAM)),
-                    (above, (*exposures.MONITORS, *shares, *BEAM)),
+                    (entries, (*exposures.MONITORS, *shares, *BEAM)),
                 )
                 for name in those
                 if (place := first(where, name, find=there)) is not None
@@ -306,8 +307,7 @@ class _Layout(NamedTuple):
         }
         kept = [("flat", places["data_white"]), ("dark", places["data_dark"])]
         flats = {name: place for name, place in self.exposures if _size(place) == 1}
-        if (time := _flat_time(path)) is not None:
-            flats[exposures.EXCHANGE] = time
+        flats |= {exposures.EXCHANGE: time} if (time := _flat_time(path)) else {}
         return self._replace(
             angles=places["theta"] or self.angles,
             fields=[(n, p) for n, p in kept if p is not None],

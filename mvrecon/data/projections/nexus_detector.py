@@ -28,9 +28,9 @@ DETECTOR_BEAM = (
     "virtual_pixel_interpolation_applied",
 )
 BEAM = (
+    *("beam/incident_energy", "beam/incident_wavelength"),
     *("instrument/beam/incident_energy", "instrument/beam/incident_wavelength"),
     *("instrument/monochromator/energy", "instrument/source/voltage"),
-    *("beam/incident_energy", "beam/incident_wavelength"),
 )
 #: Data sets of each pixel and of each frame of a detector, and single numbers.
 LIMITS = ("pixel_mask", "sequence_number")
