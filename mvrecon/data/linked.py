@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,7 +11,8 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file
-from mvrecon.core.files.keys import Key, check_keys, has_effect, unknown_names
+from mvrecon.core.files.keys import SAID, Key, check_keys, has_effect, unknown_names
+from mvrecon.core.files.prose import said
 from mvrecon.data.storage import (
     check_attributes,
     check_chunks,
@@ -27,8 +29,12 @@ MAX_LINKS, MAX_GROUPS = 16, 2**14
 MAX_TEXTS = 16
 #: Most values of a data set that is read whole, such as the angles.
 MAX_VALUES = 2**20
+#: The attribute by which a dimension scale states what it belongs to.
+REFERENCES = "REFERENCE_LIST"
 #: Attributes by which files state units.
 UNITS = ("units", "unit")
+#: Attributes of free text.
+TEXTS = ("comment", "description", "long_name", "title", "label", "history")
 
 #: Attributes of data sets besides those with a word of `EFFECTS`, which are refused; a warning
 #: names all others.
@@ -42,15 +48,16 @@ ATTRIBUTES = (
         "attributes of the frames and of the angles",
     ),
     Key(
-        "NX_class, long_name, target, signal, primary, axis, interpretation, description, name, "
-        "local_name, short_name, title, label, comment, source, date, timestamp, start_time, "
+        "NX_class, target, signal, primary, axis, interpretation, name, local_name, short_name, "
+        "source, date, timestamp, start_time, "
         "end_time, creator, *version, *Version, NeXus_*, publisher, program, author, user, "
-        "operator, facility, beamline, history, uncertainties, check_sum, default, default_slice, "
+        "operator, facility, beamline, uncertainties, check_sum, default, default_slice, "
         "auxiliary_signals, SILX_style*, NDArrayNumDims, NDArrayColorMode, NDAttr*, image_nr_*, "
         "decimals, file_*, equipment_component",
         "ignored",
         "texts, links and plots of NeXus and areaDetector",
     ),
+    Key(", ".join(TEXTS), "ignored", SAID),
     Key(
         "shape, dtype, doc, data_type, dimension, num_pixels_?, num_channels",
         "ignored",
@@ -189,7 +196,7 @@ def unknown_around(place: Place) -> list[str]:
 
 def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
     """The attributes of a data set or group that neither its reader nor `ATTRIBUTES` know, as
-    <data set>@<name>; not those that are zero.
+    <data set>@<name>, not those that are zero; and what its `TEXTS` state.
 
     Raises:
         Refused: one of `ATTRIBUTES` to refuse.
@@ -202,8 +209,10 @@ def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
             for name in stored.attrs
             if not has_effect(name, "") and value_in(stored, name, stored.attrs.get_id(name)) != 0
         ]
+        texts = [name for name in TEXTS if name in stored.attrs and name not in known]
     own = place.name.rpartition("/")[2] or "/"
-    return [f"{own}@{name}" for name in unknown_names(names, ATTRIBUTES) if name not in known]
+    unknown = [f"{own}@{name}" for name in unknown_names(names, ATTRIBUTES) if name not in known]
+    return unknown + said((f"{own}@{name}", texts_at([place], name)[place]) for name in texts)
 
 
 def values_at(place: Place, known: tuple[str, ...] = ()) -> np.ndarray:
@@ -240,7 +249,8 @@ def numbers_at(place: Place, attribute: str) -> np.ndarray | None:
         if attribute not in attributes:
             return None
         kind = attributes.get_id(attribute)
-        if kind.dtype.kind not in "iuf" or not 0 < math.prod(kind.shape or ()) <= MAX_TEXTS:
+        count = 0 if kind.shape is None else math.prod(kind.shape)
+        if kind.dtype.kind not in "iuf" or not 0 < count <= MAX_TEXTS:
             got = f"{kind.dtype} {kind.shape}"
             raise Refused(f"{place}: expected its {attribute} as numbers, got {got}")
         return np.ravel(attributes[attribute])
@@ -261,6 +271,9 @@ def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
                 continue
             kind = stored.attrs.get_id(attribute) if attribute else stored
             text, count = h5py.check_string_dtype(kind.dtype), math.prod(kind.shape or ())
+            if kind.shape is None:
+                found[place] = ""
+                continue
             if text is None or not 0 < count <= MAX_TEXTS or kind.dtype.itemsize > 2**16:
                 found[place] = str(kind.dtype)
                 continue
@@ -276,6 +289,11 @@ def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
     return found
 
 
+def units_at(places: Sequence[Place]) -> dict[Place, str]:
+    """The unit that each data set states by an attribute of `UNITS`, where there is one."""
+    return {place: text for name in UNITS[::-1] for place, text in texts_at(places, name).items()}
+
+
 def units_of(places: Sequence[Place], names: Sequence[str] = UNITS) -> str:
     """The units that data sets state by attributes of these names, several joined by " or "; empty
     without one.
@@ -284,20 +302,30 @@ def units_of(places: Sequence[Place], names: Sequence[str] = UNITS) -> str:
     return " or ".join(sorted(stated - {""}))
 
 
+#: What stands before and behind the name of an axis of a detector; other words before it, as in
+#: sample_x, are those of a stage.
+BEFORE = (
+    "(?:(?:.*[_ .-])?(?:det(?:ector)?|cam(?:era)?|pix(?:el)?|px|image|img|frame|proj(?:ection)?|"
+    "data|axis|dim|num|n)[_ .-]?)?"
+)
+BEHIND = "(?:[_ .-]?(?:pix(?:els?)?|px|axis|dim|index|coord(?:inate)?s?|mm|um))?"
 #: Names of axes in their order: of frames, and of volumes.
 VIEW_AXES = (
     r".*(theta|angle|rotation|frame|view|projection|camera|image).*",
-    r"(.*[_ ])?(y|v|rows?|height|vertical)",
-    r"(.*[_ ])?(x|u|columns?|cols?|width|horizontal)",
+    rf"{BEFORE}(y|v|rows?|height|vertical){BEHIND}",
+    rf"{BEFORE}(x|u|col|columns?|cols|width|horizontal){BEHIND}",
 )
 VOLUME_AXES = ("n|index|volume|case|id", "z|d|depth", "y|h|rows?|height", "x|w|columns?|width")
+#: The unit behind the name of an axis.
+UNIT_OF_AXIS = re.compile(r"\s*[\[(/].*")
 #: Short names of axes, which may stand in one word.
-LETTERS = "ntzyxdhwvu"
+LETTERS = "nmtzyxdhwvu"
 
 
 def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
     """Check the axes that a data set, or a group of NXdata, states by DIMENSION_LABELS, `axes`,
-    `order`, `<axis>_indices`, or CIL's `dim0` and so on; unknown names may be anywhere.
+    `order`, `<axis>_indices`, CIL's `dim0` and so on, or dimension scales; unknown names may be
+    anywhere.
 
     Args:
         place: place of the data set or group.
@@ -309,9 +337,8 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
     """
     stated: list[tuple[str, int, str]] = []
     for attribute in ("DIMENSION_LABELS", "axes", "order"):
-        text = texts_at([place], attribute).get(place, "").strip("[]() ").lower()
-        short = len(text) == len(axes) and {*text} <= {*LETTERS}
-        names = [*text] if short else re.split(r"[:,\s]+", text)
+        text = texts_at([place], attribute).get(place, "").strip("[](){} ").lower()
+        names = _names_of_axes(text, len(axes))
         if attribute == "order" and text and len(names) != len(axes):
             raise Refused(f"{place}: expected {expected}, got the order {text!r}; remove it")
         if len(names) == len(axes):
@@ -325,13 +352,56 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
         found = numbers_at(place, attribute)
         if found is not None and len(found) == 1:
             stated.append((attribute.removesuffix("_indices").lower(), int(found[0]), attribute))
-    for name, n, attribute in stated:
+    stated += _scales(place)
+    for stated_name, n, attribute in stated:
+        name = UNIT_OF_AXIS.sub("", stated_name)
         known = [k for k, pattern in enumerate(axes) if re.fullmatch(pattern, name)]
         if known and known[-1] != n:
             raise Refused(
                 f"{place}: expected {expected}, got the axis {name!r} at the place {n} by its "
                 f"{attribute}; transpose the values, or correct it"
             )
+
+
+def _names_of_axes(text: str, count: int) -> list[str]:
+    """The names of so many axes in a text: its letters, or its words without quotes, by the first
+    signs that part it into so many; else its parts.
+    """
+    if len(text) == count and {*text} <= {*LETTERS}:
+        return [*text]
+    names: list[str] = []
+    for signs in (":", "[:,;|/*]", r"[:,;|/*\s]+"):
+        names = [part.strip("[](){}'\" ") for part in re.split(signs, text)]
+        if len(names) == count:
+            break
+    return names
+
+
+def _scales(place: Place) -> list[tuple[str, int, str]]:
+    """The names of the dimension scales of a data set in its group and those above it, each with
+    its axis, by the references of these scales: the data set's own are of variable length, in whose
+    reading libhdf5 trusts the file.
+    """
+    found: list[tuple[str, int, str]] = []
+    with opened(place.path) as file:
+        own: Any = file[place.name]
+        for group in groups_above(place):
+            holder = file[group.name]
+            names = [*holder] if isinstance(holder, h5py.Group) else []
+            links = {name: holder.get(name, getlink=True) for name in names}
+            scales = [holder[name] for name in names if isinstance(links[name], h5py.HardLink)]
+            for scale in scales:
+                if not isinstance(scale, h5py.Dataset) or not scale.is_scale:
+                    continue
+                kind = scale.attrs.get_id(REFERENCES) if REFERENCES in scale.attrs else None
+                if kind is None or kind.dtype.names is None or math.prod(kind.shape) > MAX_VALUES:
+                    continue
+                name = scale.name.rpartition("/")[2].lower()
+                for target, axis in np.ravel(scale.attrs[REFERENCES]).tolist():
+                    with suppress(KeyError, ValueError):  # data sets that were deleted
+                        if file[target] == own:
+                            found.append((name, int(axis), "dimension scales"))
+    return found
 
 
 def groups(file: h5py.File) -> Iterator[h5py.Group]:
@@ -349,6 +419,30 @@ def groups(file: h5py.File) -> Iterator[h5py.Group]:
             if isinstance(group.get(name, getlink=True), h5py.HardLink):
                 if group.get(name, getclass=True) is h5py.Group:
                     waiting.append(group[name])
+
+
+def groups_of(names: Sequence[Place]) -> dict[Place, str]:
+    """The groups in which data sets are, also by the links to them, with their names there."""
+    found: dict[Place, str] = {}
+    for place in names:
+        for path, name, _ in (*place.links, place):
+            group, _, own = name.rpartition("/")
+            found.setdefault(Place(path, group or "/"), own)
+    return found
+
+
+def groups_above(group: Place) -> Iterator[Place]:
+    """A group and those that it is in, up to the file's root."""
+    parts = group.name.strip("/").split("/")
+    return (Place(group.path, "/" + "/".join(parts[:k])) for k in range(len(parts), -1, -1))
+
+
+def members(group: Place | None) -> list[str]:
+    """Names of the members of a group; none of what is no group."""
+    if group is None:
+        return []
+    with opened(group.path) as file:
+        return [*found] if isinstance(found := file[group.name], h5py.Group) else []
 
 
 def listing(path: Path, most: int = 12) -> str:

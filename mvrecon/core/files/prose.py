@@ -18,8 +18,12 @@ ENTRY = re.compile(r"([^\W\d][^:=\t\"']*?)[\"']?\s*[:=\t]\s*(.*)")
 INNER = re.compile(r"(?:[^\W\d][\"']?\s*:|\w[\"']?\s*=)(?![\\/])")
 #: Characters of a part of a text that are shown.
 SHOWN = 80
-#: Words of prose, beside those of keys, on what was done to grey values.
-WORDS = {**IMAGE_EFFECTS, r"divided|rotated|optical.?densit|(?<![a-z])(ln|log(10|2|e)?) ?\(": None}
+#: Words of prose, beside those of keys, on what was done to grey values or to angles.
+WORDS = {
+    **IMAGE_EFFECTS,
+    r"divided|rotated|optical.?densit|(?<![a-z])(ln|log(10|2|e)?) ?\(": None,
+    "(?<!counter)(?<!counter.)(?<!anti)(?<!anti.)clock.?wise": None,
+}
 WORD = re.compile("|".join(WORDS))
 
 

@@ -200,6 +200,7 @@ class FrameViews(ProjectionStack):
         super().__init__(frames.place.path, names, frames.shape[1:], frames.dtype)
         self.fields, self.rig, self.detector = fields or {}, rig, frames.region
         self.stated = {name: texts[numbers].tolist() for name, texts in (stated or {}).items()}
+        self.kept = np.isin(np.arange(frames.shape[0]), numbers)
         self._marked, self._top, self.unknown = marked, top, [*frames.unknown, *unknown]
         self.units = frames.units
         if "flat" in self.fields:

@@ -4,7 +4,7 @@
 
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ import numpy as np
 from mvrecon.core.files.checks import Refused, check_file, file_errors, millimetres, shown
 from mvrecon.core.files.keys import IMAGE_EFFECTS, unknown_names
 from mvrecon.data.linked import (
+    UNITS,
     VIEW_AXES,
     MissingFile,
     Place,
@@ -22,9 +23,14 @@ from mvrecon.data.linked import (
     check_order,
     followed,
     groups,
+    groups_above,
+    groups_of,
     listing,
+    members,
     texts_at,
+    units_at,
     unknown_around,
+    unknown_attributes,
     values_at,
 )
 from mvrecon.data.projections import exposures, nexus_axes
@@ -39,6 +45,8 @@ from mvrecon.data.projections.nexus_detector import (
     INVALID,
     VIEW,
     first,
+    kinds_in,
+    limits_in,
     limits_of,
     of_frames,
     there,
@@ -56,6 +64,8 @@ FRAMES = "frames [m v u], or [v m u] of views.layout=sinogram"
 IN_FILE = re.compile(r"(?P<path>.+\.\w+):(?P<name>/.*)")
 #: Words of fields beside the frames by the values of these that change nothing; of others it is 0.
 FIELD_EFFECTS = {**IMAGE_EFFECTS, "binning": 1}
+#: Keys that do not count, wherever they stand, or that are read wherever they do.
+IDLE = [key for key in KEYS if key.use == "ignored" or key in nexus_axes.KEYS]
 #: Sources whose beams are parallel; those of NeXus's other kinds, such as tubes, are not.
 PARALLEL = re.compile("synchrotron|neutron|muon|free.electron", re.IGNORECASE)
 #: Pixels by which a sample may move between views.
@@ -155,6 +165,8 @@ class _Layout(NamedTuple):
     flats: Sequence[tuple[str, Place]] = ()  # exposures of flat fields beside the frames
     moves: Sequence[Place] = ()
     names: Sequence[Place] = ()  # of the frames: in these groups are the keys beside them
+    others: Sequence[str] = ()  # monitors and beams of other names than those that are read
+    used: Sequence[Place] = ()  # what the layout found, beside the frames too
 
     @property
     def axes(self) -> tuple[str, str, str]:
@@ -198,10 +210,14 @@ class _Layout(NamedTuple):
         elif one not in known:
             layout = layout._replace(angles=None)
         if sinogram:  # what is stated of frames is not of rows
-            layout = layout._replace(sinogram=True, exposures=(), moves=())
+            layout = layout._replace(sinogram=True, exposures=())
+        other = layout.key is not None and _size(layout.key) != _count(layout.frames)
+        if dataset is not None and other:  # such as of the frames that these were made of
+            layout = layout._replace(key=None)
+        layout = layout._replace(used=layout._found())
         for place in names[one]:  # NXdata may scale what it links to, or state its axes
             check_around(place)
-        for group, own in _groups(names[one]).items():
+        for group, own in groups_of(names[one]).items():
             if texts_at([group], "signal").get(group, own) == own:
                 check_order(group, layout.axes, FRAMES)
         return layout
@@ -209,10 +225,14 @@ class _Layout(NamedTuple):
     @classmethod
     def _tomo(cls, names: Sequence[Place]) -> "_Layout":
         """The layout of NXtomo, by the names of the frames."""
-        beside = [*_groups(names)]
-        above = [outer for group in beside for outer in _outer(group)]
-        frames = names[0]
-        source = first(above, "instrument/source/type", "source/type")
+        beside = [*groups_of(names)]
+        exchange = [Place(path, "/measurement") for path in dict.fromkeys(g.path for g in beside)]
+        above = [*(outer for group in beside for outer in groups_above(group)), *exchange]
+        detectors = [*beside, *(g._replace(name=f"{g.name}/instrument/detector") for g in exchange)]
+        frames, instrument = names[0], first(above, "instrument", find=there)
+        kinds = {} if instrument is None else kinds_in([*groups_above(instrument)][:2])
+        sources = [group for group, kind in kinds.items() if kind == "NXsource"]
+        source = first(above, "instrument/source/type", "source/type") or first(sources, "type")
         kind = None if source is None else texts_at([source], "").get(source)
         parallel = kind is None or PARALLEL.search(kind)
         for axis, option in (("x", "columns"), ("y", "rows")):
@@ -223,9 +243,18 @@ class _Layout(NamedTuple):
                     f"views.flip_{option}=true so is the volume",
                     stacklevel=2,
                 )
-        nexus_axes.warn_of_turned(beside)
-        instrument = first(above, "instrument", find=there)
-        shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in _members(instrument)]
+        moves = [
+            *nexus_axes.warn_of_turned(beside),
+            *nexus_axes.translations(
+                stage
+                for group in above
+                for stage in nexus_axes.transformations_in(
+                    group._replace(name=f"{group.name}/sample")
+                )
+            ),
+        ]
+        entries = [group for group in above if group.name.rpartition("/")[2] != "instrument"]
+        shares = [f"instrument/{name}/{exposures.ATTENUATOR}" for name in members(instrument)]
         sizes = [
             [first(above, f"sample/{axis}_pixel_size"), first(beside, f"{axis}_pixel_size")]
             for axis in "yx"
@@ -241,8 +270,8 @@ class _Layout(NamedTuple):
             exposures=[
                 (name, place)
                 for where, those in (
-                    (beside, (*exposures.DETECTOR, *DETECTOR_BEAM)),
-                    (above, (*exposures.MONITORS, *shares, *BEAM)),
+                    (detectors, (*exposures.DETECTOR, *DETECTOR_BEAM)),
+                    (entries, (*exposures.MONITORS, *shares, *BEAM)),
                 )
                 for name in those
                 if (place := first(where, name, find=there)) is not None
@@ -250,9 +279,17 @@ class _Layout(NamedTuple):
             moves=[
                 place
                 for axis in "xyz"
-                if (place := first(above, f"sample/{axis}_translation")) is not None
-            ],
+                for where, name in ((above, "sample/"), (beside, ""))
+                if (place := first(where, f"{name}{axis}_translation")) is not None
+            ]
+            + moves,
             names=names,
+            others=[
+                name
+                for group, kind in kinds.items()
+                if kind in ("NXmonitor", "NXbeam")
+                and (name := group.name.rpartition("/")[2]) not in ("control", "beam")
+            ],
         )
 
     def _exchange(self, path: Path, sinogram: bool) -> "_Layout":
@@ -269,13 +306,12 @@ class _Layout(NamedTuple):
             for name in ("data_white", "data_dark", "theta")
         }
         kept = [("flat", places["data_white"]), ("dark", places["data_dark"])]
-        times = [there(path, "/measurement/instrument/detector/exposure_time"), _flat_time(path)]
-        stated = [[(exposures.EXCHANGE, time)] if time is not None else [] for time in times]
+        flats = {name: place for name, place in self.exposures if _size(place) == 1}
+        flats |= {exposures.EXCHANGE: time} if (time := _flat_time(path)) else {}
         return self._replace(
             angles=places["theta"] or self.angles,
             fields=[(n, p) for n, p in kept if p is not None],
-            exposures=[*self.exposures, *stated[0]],
-            flats=stated[1] or stated[0],
+            flats=[*flats.items()],
         )
 
     def opened(self, scan: Path, field: str | None = None) -> ProjectionStack:
@@ -286,13 +322,17 @@ class _Layout(NamedTuple):
         keys = self._keys(frames.shape[0])
         lengths = [place for pair in self.pixel for place in pair]
         monitors = [place for _, place in (*self.exposures, *self.flats)]
-        units = texts_at([*lengths, *monitors], "units")
+        units = units_at([*lengths, *monitors])
         stated = {n: of_frames(n, p, keys, units.get(p, "")) for n, p in self.exposures}
         angles = [] if self.angles is None else [self.angles]
         below = [stage for place in angles for stage in nexus_axes.translations_below(place)]
+        near = {} if self.sinogram or field is not None else limits_in([*groups_of(self.names)])
+        marks = [place for place in (self.key, near.get("pixel_mask")) if place is not None]
         unknown = [
-            *self._unknown_fields(below),
+            *self._unknown_fields(below, frames.parts, field),
+            *self.others,
             *(name for place in angles for name in unknown_around(place)),
+            *(name for place in marks for name in unknown_attributes(place)),
         ]
         fields: dict[str, ProjectionStack] = {
             name: FrameViews(frames, np.flatnonzero(keys == key), stated=stated, unknown=unknown)
@@ -301,11 +341,16 @@ class _Layout(NamedTuple):
         }
         for name, place in self.fields:
             others = Frames(place, folder)
+            if not self.sinogram:  # else in either order, by its size
+                check_order(place, VIEW_AXES, FRAMES)
             kind = np.full(others.shape[0], FLAT)
             of_flats = {
                 n: of_frames(n, p, kind, units.get(p, "")) for n, p in self.flats if name == "flat"
             }
-            fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats)
+            beside = self._replace(names=[place], angles=None)._unknown_fields(
+                (), others.parts, name
+            )
+            fields[name] = FrameViews(others, np.arange(len(kind)), stated=of_flats, unknown=beside)
         if field in fields:
             return fields[field]
         if field is None and texts_at([self.frames], "MATLAB_class"):
@@ -322,7 +367,7 @@ class _Layout(NamedTuple):
         if (pixel := self._pixel_mm(units)) is not None:
             rig["detector"]["pixel_mm"] = pixel
         self._warn_of_moves(keys, pixel, below)
-        limits = limits_of([] if self.sinogram else [*_groups(self.names)], frames, keys)
+        limits = limits_of(near, frames, keys)
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
 
     def of_field(self, folder: Path) -> "_Layout":
@@ -330,30 +375,50 @@ class _Layout(NamedTuple):
         stands beside them for another number of frames, such as views.
         """
         count = Frames(self.frames, folder).shape[0]
-
-        def fits(place: Place) -> bool:
-            with opened(place.path) as file:
-                return getattr(file[place.name], "size", 0) in (1, count)
-
         return self._replace(
-            key=self.key if self.key and fits(self.key) else None,
+            key=self.key if self.key and _size(self.key) == count else None,
             angles=None,
             pixel=(),
-            exposures=[one for one in self.exposures if fits(one[1])],
+            exposures=[one for one in self.exposures if _size(one[1]) in (1, count)],
             moves=(),
         )
 
-    def _unknown_fields(self, below: Sequence[Place]) -> list[str]:
-        """Data sets beside the frames and beside the angles that no key knows, but those on which
-        the angles depend.
+    def _found(self) -> list[Place]:
+        """The data sets that the layout uses, or that do not count beside those."""
+        beside = [*groups_of(self.names)]
+        keys = [first(beside, name) for name in ("image_key_control", "image_key")]
+        flips = [first(beside, f"{axis}_flipped", find=there) for axis in "xy"]
+        found = [
+            *(place for place in (*(keys if self.key else ()), *flips) if place is not None),
+            *(place for pair in self.pixel for place in pair),
+            *(place for _, place in (*self.fields, *self.exposures, *self.flats)),
+            *([] if self.sinogram else limits_in(beside).values()),
+        ]
+        return [*self.moves, *found, *([] if self.angles is None else [self.angles])]
+
+    def _unknown_fields(
+        self, below: Sequence[Place], parts: Sequence[Place], field: str | None
+    ) -> list[str]:
+        """Data sets beside the frames, their parts and the angles that no key knows, but those on
+        which the angles depend; and of views those beside the frames, and beside parts if they have
+        no such name, that a key knows and that are not used.
         """
-        names = _groups([*self.names, *([] if self.angles is None else [self.angles])])
+        angles = [] if self.angles is None else [self.angles]
+        own, others = groups_of(self.names), groups_of(parts)
+        names = own | others | groups_of(angles)
+        used = {*map(address, (*self.names, *self.used, *angles))}
+        restated = {place.name.rpartition("/")[2] for place in (*self.used, *angles, *below)}
         found: list[str] = []
-        for place in names:
-            with opened(place.path) as file:
-                found += fields_in(file[place.name], FIELD_EFFECTS)
-        known = {*names.values(), *(place.name.rpartition("/")[2] for place in below)}
-        return [name for name in unknown_names(found, KEYS) if name not in known]
+        for group in names:
+            with opened(group.path) as file:
+                fields = fields_in(file[group.name], FIELD_EFFECTS)
+            unknown = unknown_names(fields, KEYS if field or group not in {*own, *others} else IDLE)
+            for name in unknown:
+                place = there(group.path, f"{group.name}/{name}")
+                known = name in restated if group not in own else False
+                if not known and (place is None or address(place) not in used):
+                    found.append(name)
+        return [name for name in dict.fromkeys(found) if name not in names.values()]
 
     def _keys(self, count: int) -> np.ndarray:
         """The image_key of each of so many frames; all are views without one."""
@@ -376,18 +441,20 @@ class _Layout(NamedTuple):
     def _warn_of_moves(
         self, keys: np.ndarray, pixel: tuple[float, float] | None, below: Sequence[Place]
     ) -> None:
-        """Warn of translations of the sample between views, by more than a part of a pixel."""
+        """Warn of translations of the sample or the detector between views, by more than a part of
+        a pixel.
+        """
         for place in dict.fromkeys((*self.moves, *below)):
-            moved = values_at(place, ("units", *nexus_axes.ATTRIBUTES)).ravel()
-            views = moved[keys == VIEW] if len(moved) == len(keys) else moved[:0]
-            far = np.ptp(views) if len(views) else 0
-            unit = texts_at([place], "units").get(place)
+            moved = values_at(place, (*UNITS, *nexus_axes.ATTRIBUTES)).ravel()
+            far = np.ptp(moved[keys == VIEW] if len(moved) == len(keys) else moved)
+            unit = units_at([place]).get(place)
             if far and not (
                 pixel and unit and far * millimetres(place, unit) < MAX_MOVE_PX * min(pixel)
             ):
                 warnings.warn(
                     f"{place}: the sample moved by {far:g}{f' {unit}' if unit else ''} between "
-                    f"views, which the rig does not follow; calibrate=[shifts] fits shifts",
+                    f"views, in relation to the detector, which the rig does not follow; "
+                    f"calibrate=[shifts] fits shifts",
                     stacklevel=3,
                 )
 
@@ -396,7 +463,7 @@ class _Layout(NamedTuple):
         for pair in self.pixel:
             sizes = []
             for place in pair:
-                values = np.unique(values_at(place, ("units",)))
+                values = np.unique(values_at(place, UNITS))
                 if not (unit := units.get(place)):
                     warnings.warn(f"{place}: has no units, and is not used", stacklevel=2)
                 elif len(values) == 1 and values[0] > 0:
@@ -408,28 +475,17 @@ class _Layout(NamedTuple):
         return None
 
 
-def _groups(names: Sequence[Place]) -> dict[Place, str]:
-    """The groups in which data sets are, also by the links to them, with their names there."""
-    found: dict[Place, str] = {}
-    for place in names:
-        for path, name, _ in (*place.links, place):
-            group, _, own = name.rpartition("/")
-            found.setdefault(Place(path, group or "/"), own)
-    return found
+def _size(place: Place) -> int:
+    """The number of values of a data set; 0 of a group."""
+    with opened(place.path) as file:
+        return getattr(file[place.name], "size", 0)
 
 
-def _outer(group: Place) -> Iterator[Place]:
-    """A group and those that it is in, up to the file's root."""
-    parts = group.name.strip("/").split("/")
-    return (Place(group.path, "/" + "/".join(parts[:k])) for k in range(len(parts), -1, -1))
-
-
-def _members(group: Place | None) -> list[str]:
-    """Names of the members of a group; none of what is no group."""
-    if group is None:
-        return []
-    with opened(group.path) as file:
-        return [*found] if isinstance(found := file[group.name], h5py.Group) else []
+def _count(frames: Place) -> int:
+    """The number of frames [m v u], or of the one [v u], of a data set; 0 of others."""
+    with opened(frames.path) as file:
+        shape = getattr(file[frames.name], "shape", None) or ()
+    return shape[0] if len(shape) == 3 else 1
 
 
 def _flat_time(path: Path) -> Place | None:

@@ -8,7 +8,7 @@ runs upwards and z along the beam.
 
 import math
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import h5py
 import numpy as np
@@ -45,6 +45,8 @@ KEYS = (
     Key("depends_on", "compared", "other rotations are refused, translations warned of"),
     Key("transformations", "compared", "of the detector: views.flip_columns, flip_rows; warned of"),
 )
+#: Types of transformations by the names that nxtomo gives them.
+KINDS = {f"{kind[0]}{axis}": kind for kind in ("rotation", "translation") for axis in "xyz"}
 #: Sine of the angle by which an upright axis may lean, and most transformations of a chain.
 MAX_LEAN, MAX_CHAIN = 2e-3, 16
 
@@ -138,7 +140,7 @@ def translations_below(angles: Place) -> Iterator[Place]:
         kind = texts_at([place], "transformation_type").get(place, "translation")
         if kind.strip().lower() != "rotation":
             yield place
-        elif (turned := values_at(place, ("units", *ATTRIBUTES))).any():
+        elif (turned := values_at(place, (*UNITS, *ATTRIBUTES))).any():
             raise Refused(
                 f"{angles}: expected an axis that no other rotation turns, got {place} of up to "
                 f"{np.abs(turned).max():g}"
@@ -174,27 +176,40 @@ def _chain(place: Place, name: str) -> Iterator[Place]:
     raise Refused(f"{start}: expected at most {MAX_CHAIN} transformations by depends_on, got more")
 
 
-def warn_of_turned(groups: Sequence[Place]) -> None:
+def transformations_in(group: Place) -> list[Place]:
+    """What the group `transformations` of a detector or a sample contains."""
+    if (chain := followed(group.path, f"{group.name}/transformations")) is None:
+        return []
+    with opened(chain.path) as file:
+        names = list(found) if isinstance(found := file[chain.name], h5py.Group) else []
+    places = [followed(chain.path, f"{chain.name}/{name}") for name in names]
+    return [place for place in places if place is not None]
+
+
+def translations(stages: Iterable[Place]) -> list[Place]:
+    """The translations among transformations, each once."""
+    return [stage for stage in dict.fromkeys(stages) if _kind(stage) == "translation"]
+
+
+def _kind(stage: Place) -> str:
+    """The type of a transformation, as it states it or by its name; else empty."""
+    stated = texts_at([stage], "transformation_type").get(stage, "").strip().lower()
+    return stated or KINDS.get(stage.name.rpartition("/")[2], "")
+
+
+def warn_of_turned(groups: Sequence[Place]) -> list[Place]:
     """Warn of a detector that its transformations turn, as those of mirrored frames do: those in
-    its group `transformations`, and of the chain of its `depends_on`.
+    its group `transformations`, and of the chain of its `depends_on`; return its translations.
 
     Args:
         groups: groups in which the frames are, such as that of the detector.
     """
-    places: list[Place | None] = []
-    for detector in groups:
-        if (chain := followed(detector.path, f"{detector.name}/transformations")) is not None:
-            with opened(chain.path) as file:
-                names = list(group) if isinstance(group := file[chain.name], h5py.Group) else []
-            places += [followed(chain.path, f"{chain.name}/{name}") for name in names]
-        places += _stages(detector)
-    for place in dict.fromkeys(place for place in places if place is not None):
-        name, kind = place.name.rpartition("/")[2], texts_at([place], "transformation_type")
-        kind = kind.get(place, "").strip().lower()
-        turns = kind == "rotation" or (not kind and name in ("rx", "ry", "rz"))
-        if turns and values_at(place, ("units", *ATTRIBUTES)).any():
+    stages = [stage for group in groups for stage in (*transformations_in(group), *_stages(group))]
+    for place in dict.fromkeys(stages):
+        if _kind(place) == "rotation" and values_at(place, (*UNITS, *ATTRIBUTES)).any():
             warnings.warn(
                 f"{place}: the detector is turned; without views.flip_columns=true or "
                 f"views.flip_rows=true the volume may be mirrored",
                 stacklevel=2,
             )
+    return translations(stages)

@@ -5,14 +5,14 @@ and greatest grey value (Könnecke and others, J. Appl. Cryst. 48, 2015).
 import math
 import re
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, shown
 from mvrecon.core.files.keys import Key
-from mvrecon.data.linked import MissingFile, Place, followed, texts_at, values_at
+from mvrecon.data.linked import UNITS, MissingFile, Place, followed, members, texts_at, values_at
 from mvrecon.data.projections import exposures
 from mvrecon.data.projections.exposures import unneeded
 from mvrecon.data.projections.frames import Frames
@@ -28,10 +28,12 @@ DETECTOR_BEAM = (
     "virtual_pixel_interpolation_applied",
 )
 BEAM = (
+    *("beam/incident_energy", "beam/incident_wavelength"),
     *("instrument/beam/incident_energy", "instrument/beam/incident_wavelength"),
     *("instrument/monochromator/energy", "instrument/source/voltage"),
 )
-#: Single numbers of a detector.
+#: Data sets of each pixel and of each frame of a detector, and single numbers.
+LIMITS = ("pixel_mask", "sequence_number")
 NUMBERS = ("saturation_value", "underload_value")
 #: The type of numbers.
 NUMERIC = re.compile(r"(u?int|float|bool)\d*")
@@ -116,32 +118,41 @@ def _texts_of(name: str, place: Place, unit: str) -> list[str]:
     if number:
         values, unit = np.array([float(number[1])]), number[2] or unit
     else:
-        values = values_at(place, ("units",)).ravel().astype(float)
+        values = values_at(place, UNITS).ravel().astype(float)
     if not beam:
         values = exposures.in_base_units(values, name, unit, place)
     end = f" {unit}".rstrip() if beam else ""
     return [f"{x:.12g}{end}" if np.isfinite(x) else "" for x in values]
 
 
+def kinds_in(groups: Sequence[Place]) -> dict[Place, str]:
+    """The members of groups that are groups of NeXus, also by links, with their classes."""
+    found = [
+        there(group.path, f"{group.name}/{name}") for group in groups for name in members(group)
+    ]
+    return texts_at([place for place in found if place is not None], "NX_class")
+
+
+def limits_in(groups: Sequence[Place]) -> dict[str, Place]:
+    """What `limits_of` reads in groups, such as that of the detector, by name."""
+    found = {name: first(groups, name, find=there) for name in (*LIMITS, *NUMBERS)}
+    return {name: place for name, place in found.items() if place is not None}
+
+
 def limits_of(
-    groups: Sequence[Place], frames: Frames, keys: np.ndarray
+    places: Mapping[str, Place], frames: Frames, keys: np.ndarray
 ) -> tuple[np.ndarray | None, float | None]:
     """Pixels that the detector's mask marks as bad, and its greatest grey value; None of what
     it does not state. Compares the order of the frames.
 
     Args:
-        groups: groups in which the frames are, such as that of the detector.
+        places: what stands beside the frames, see `limits_in`.
         frames: all frames of the file.
         keys: image_key of each frame.
 
     Warns:
         UserWarning: a mask of another size, other values than one number, an underload.
     """
-    places = {
-        name: place
-        for name in ("pixel_mask", "sequence_number", *NUMBERS)
-        if (place := first(groups, name, find=there)) is not None
-    }
     if (place := places.get("sequence_number")) is not None:
         _check_sequence(place, keys)
     numbers = {name: _number(places[name]) for name in NUMBERS if name in places}
@@ -155,7 +166,7 @@ def limits_of(
 def _number(place: Place) -> float:
     """A number of a detector; 0 of another one, with a warning."""
     with unneeded():
-        values = values_at(place, ("units",)).ravel().astype(float)
+        values = values_at(place, UNITS).ravel().astype(float)
         if len(values) != 1 or not np.isfinite(values[0]):
             raise Refused(f"{place}: expected one number, got {shown(values.tolist())}")
         return float(values[0])
@@ -188,7 +199,7 @@ def _check_sequence(place: Place, keys: np.ndarray) -> None:
     """
     own, views = np.zeros(0), np.flatnonzero(keys == VIEW)
     with unneeded():
-        numbers = values_at(place, ("units",)).ravel()
+        numbers = values_at(place, UNITS).ravel()
         if len(numbers) not in (len(keys), len(views)):
             raise Refused(
                 f"{place}: expected a number of each of {len(keys)} frames or {len(views)} views, "

@@ -33,7 +33,7 @@ KEYS = (
     ),
     Key("data@MATLAB_class", "compared", "warned of, as MATLAB reverses the order of axes"),
     Key("scale_factor, add_offset, _FillValue", "refused", "apply it", (1, 0, "nan")),
-    Key("source/type", "applied", "beams of tubes are not parallel: the camera is asked for"),
+    Key("source/type", "applied", "or of any NXsource: beams of tubes are not parallel"),
     Key(
         ", ".join((*exposures.DETECTOR, *exposures.MONITORS)),
         "compared",
@@ -48,11 +48,15 @@ KEYS = (
     Key(
         "DIMENSION_LABELS, rotation_angle_indices",
         "compared",
-        "with the order of frames, rows and columns, as axes of NXdata",
+        "with the order of frames, rows and columns, as axes of NXdata and dimension scales",
     ),
     Key(", ".join(REGION), "compared", "areaDetector's, of views and fields"),
     Key("x_flipped, y_flipped", "compared", "views.flip_columns, flip_rows; warned of"),
-    Key("x_translation, y_translation, z_translation", "compared", "of all views; warned of"),
+    Key(
+        "x_translation, y_translation, z_translation",
+        "compared",
+        "of sample and detector, of all views; warned of",
+    ),
     Key(
         "instrument/<group>/attenuator_transmission",
         "compared",

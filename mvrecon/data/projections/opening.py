@@ -16,7 +16,7 @@ from mvrecon.core.files.checks import Refused
 from mvrecon.core.files.keys import warn_of_unknown
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file, same
-from mvrecon.data.linked import Place, followed, listing, values_at
+from mvrecon.data.linked import UNITS, Place, followed, listing, unknown_attributes, values_at
 from mvrecon.data.projections.exposures import exposure_names, relative_exposure, warn_of_others
 from mvrecon.data.projections.faults import read_mask
 from mvrecon.data.projections.images import ENDINGS, ImageFiles, field_files, in_field, view_files
@@ -130,7 +130,7 @@ def _expected() -> str:
 def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
     """Bad pixels of a file of the views' size; raises Refused for others."""
     path = Path(path).expanduser()
-    stack = _opened(path, None, False, (), None, None, {})
+    stack = _opened(path, None, False, (), None, "mask", {})  # of no frames
     if stack.n_views > 1:
         raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
     return read_mask(path, shape, stack.read(0, 1)[0].numpy())
@@ -157,7 +157,10 @@ def exposures(
     if names := exposure_names(stack, path):
         values = relative_exposure(stack, _field(stack, where, "flat", flat, layout), names)
     elif place := _place_in(stack, path) or in_another(path):
-        values = np.ravel(values_at(place, ("units",))).astype(float)
+        values = np.ravel(values_at(place, UNITS)).astype(float)
+        if stack.kept is not None and len(values) == len(stack.kept):  # of all frames
+            values = values[stack.kept]
+        warn_of_unknown(place.path, unknown_attributes(place))
     else:
         try:
             values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES)[1])

@@ -122,6 +122,8 @@ class ProjectionStack(ABC):
     mirrored: bool = False
     #: The HDF5 file of the scan, in which options may name further data sets.
     scan: Path | None = None
+    #: Whether each frame of the file is a view; None: the files have views alone.
+    kept: np.ndarray | None = None
     #: Where negative values mark pixels that a view could not measure: the number of those that the
     #: files state for all views.
     excluded: int | None = None

@@ -1062,7 +1062,7 @@ def test_what_stands_beside_frames_counts_whatever_their_name_is(tmp_path):
         assert views.stack.rig["name"] is None  # angles of frames by name are named as well
     with h5py.File(path, "w") as file:
         file["raw"], file["pixel_mask"] = grey().swapaxes(0, 1), mask
-        file["count_time"], file["sample/x_translation"] = np.arange(1.0, VIEWS + 1), ANGLES
+        file["count_time"] = np.arange(1.0, VIEWS + 1)
     with warnings.catch_warnings(action="error"):  # of rows of sinograms no frame is stated
         hdf5_views(path, "raw", layout="sinogram")
 
