@@ -110,9 +110,9 @@ KEYS = (
 #: Texts that any program writes, unless they state more, such as "Title: scaled by 2".
 TEXTS = Key(
     "*: date, *: date.create, *: date.modify, *: date.timestamp, *: date?time, *: datetime, "
-    "*: time, *: timestamp, *: creation?time, *: title, *: author, *: artist, *: operator, "
+    "*: timestamp, *: creation?time, *: title, *: author, *: artist, *: operator, "
     "*: user, *: copyright, *: software, *: software?version, *: softwareversion, *: version, "
-    "*: make, *: model, *: host, *: hostname, *: host?computer, *: hostcomputer, *: source, "
+    "*: make, *: model, *: host, *: hostname, *: host?computer, *: hostcomputer, "
     "*: file?name, *: filename",
     "ignored",
     "texts of any program, unless they contain other entries or words such as scaled",

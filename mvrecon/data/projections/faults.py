@@ -200,7 +200,7 @@ def zingers(images: Float[Tensor, "n i j"]) -> Bool[Tensor, "n i j"]:
     if min(images.shape[1:]) < 5:
         return found
     for image, here in zip(images, found, strict=True):
-        while len((places := _peaks(image))[0]):
+        while len((places := _peaks(image))[0]):  # none of which is filled already
             here[places] = True
             image = filled(image[None], here)[0]
     return found
@@ -210,7 +210,8 @@ def _peaks(image: Float[Tensor, "i j"]) -> tuple[Tensor, Tensor]:
     """Rows and columns of pixels above all eight neighbours, beyond noise."""
     height, width = image.shape
     rise = 1 + MIN_OFF_IN_VIEWS
-    above = image[:, 1:-1] > torch.maximum(image[:, :-2], image[:, 2:]).mul_(rise)
+    beside = torch.maximum(image[:, :-2], image[:, 2:])
+    above = image[:, 1:-1] > beside.clamp_(min=0).mul_(rise)  # of light below the dark field, too
     flat = torch.from_numpy(np.flatnonzero(above.numpy()))  # which is fast where few are above
     i, j = flat // (width - 2), flat % (width - 2) + 1
     if not len(flat):
@@ -226,7 +227,7 @@ def _peaks(image: Float[Tensor, "i j"]) -> tuple[Tensor, Tensor]:
         for index, size in ((i, height), (j, width))
     )
     around = image[rows[:, :, None], columns[:, None, :]]
-    ring = around[:, 1:4, 1:4].flatten(1)[:, [0, 1, 2, 3, 5, 6, 7, 8]].amax(dim=1)
+    ring = around[:, 1:4, 1:4].flatten(1)[:, [0, 1, 2, 3, 5, 6, 7, 8]].amax(dim=1).clamp(min=0)
     rest = second_differences(around)[:, [0, 1, 3, 4]].flatten(1).abs()  # without its own row
     sigma = SIGMA_PER_MEDIAN * rest.median(dim=1).values
     sigma = torch.maximum(sigma, poisson * ring.clamp(min=LEAST_LIGHT).sqrt())

@@ -133,6 +133,7 @@ def bad_pixels(path: str | Path, shape: tuple[int, int]) -> Bool[Tensor, "v u"]:
     stack = _opened(path, None, False, (), None, "mask", {})  # of no frames
     if stack.n_views > 1:
         raise Refused(f"{path}: expected one image of bad pixels, got {stack.n_views}")
+    warn_of_unknown(path, stack.unknown)
     return read_mask(path, shape, stack.read(0, 1)[0].numpy())
 
 
@@ -236,12 +237,33 @@ def mean_field(
     if len({units.casefold() for units in (stack.units, views.units) if units}) > 1:
         unknown.append(f"{name}@units={stack.units}")
     warn_of_unknown(stack.path, unknown)
+    _compare_bits(views, stack, name)
     mean, parts = stack.mean()
     _check_alike(stack.path, name, mean, parts)
     applied = exposure_names(views, exposure)
     if applied or exposure is None or name == "dark":
         warn_of_others(views, stack, name, applied)
     return mean
+
+
+def _compare_bits(views: ProjectionStack, stack: ProjectionStack, name: str) -> None:
+    """Warn of a field whose pixels have another number of bits than those of the views: 8 and 16 by
+    their types, or as files state less than all bits of these.
+    """
+    try:
+        tops = [one.top for one in (views, stack)]
+    except Refused:  # several: a saturation is given
+        return
+    kinds = [one.dtype for one in (views, stack)]
+    if any(kind.kind not in "iu" or kind.itemsize > 2 for kind in kinds):
+        return
+    stated = [top != np.iinfo(kind).max for top, kind in zip(tops, kinds, strict=True)]
+    if tops[0] != tops[1] and stated[0] == stated[1]:
+        warnings.warn(
+            f"{stack.path}: the {name} field's greatest grey value is {tops[1]:g} by its bits, "
+            f"that of the views {tops[0]:g}; are both stored on one scale?",
+            stacklevel=3,
+        )
 
 
 def _check_alike(

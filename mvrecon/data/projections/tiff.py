@@ -5,6 +5,7 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ ANDOR_BEAM = tuple(
 #: Tags with texts of any program: tifffile writes two of the first, ImageJ keeps its Info in the
 #: second.
 TEXTS = ("ImageDescription", "IJMetadata", "GDAL_METADATA")
+#: Labels of images that are no views.
+FIELD_LABEL = re.compile("dark|flat", re.IGNORECASE)
 #: First tag of areaDetector's attributes, which are texts `name:value`.
 AREA_DETECTOR = 65010
 #: Tags of TIFF that change the pixels or their order, and those that ordinary files have; a warning
@@ -238,10 +241,25 @@ def tiff_header(file: Path) -> Header:
         texts = {name: [one.get(name, "") for one in stated] for name in names}
         head = first._replace(stated=texts)
         first = descriptions.of_file(file, head, text, own)._replace(places=places, own=own)
-        first = first._replace(unknown=unknown_names(sorted(found), TIFF_KEYS))
+        unknown = unknown_names(sorted(found), TIFF_KEYS)
+        first = first._replace(unknown=[*unknown, *_disordered(pages)])
     if _offset(pages[0]):
         return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return first
+
+
+def _disordered(pages: Any) -> list[str]:
+    """Labels of ImageJ, or names of pages, that count images in another order than theirs, or that
+    call some of them fields.
+    """
+    labels = (pages[0].tags.valueof("IJMetadata") or {}).get("Labels")
+    labels = [str(x or "") for x in labels or [page.tags.valueof("PageName") for page in pages]]
+    fields = [f"image {x!r}" for x in labels if FIELD_LABEL.match(x)]
+    if len({re.sub(r"\d+", "0", label) for label in labels}) != 1:
+        return fields
+    counts = [[*map(int, re.findall(r"\d+", label))] for label in labels]
+    wrong = (k for k, (one, other) in enumerate(pairwise(counts)) if other < one)
+    return [f"order of images, {labels[k]!r} before {labels[k + 1]!r}" for k in wrong][:1]
 
 
 def _description(file: Path, text: str) -> str:
@@ -336,6 +354,11 @@ def _check_order(
                 f"save it without that description"
             )
         return
+    order = re.search(r"^axes=(?!X,Y\b)(.*)", text, re.MULTILINE)
+    if "SCIFIO=" in text and order:
+        raise Refused(
+            f"{file}: expected SCIFIO's axes X,Y first, got {shown(order[1])}; transpose the images"
+        )
     axes = AXES.findall(text) if "ImageJ" in text or "SCIFIO" in text else []
     ome = descriptions.elements(text, "Pixels")
     sizes = [(f"Size{axis}", own.get(f"Size{axis}", 1)) for _, own in ome for axis in "CZT"]
@@ -474,6 +497,11 @@ def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
         if planes := pages[0].tags.get("UIC2tag"):  # MetaMorph's, behind one page
             images = planes.count
         for described in image.shaped_metadata or ():
+            if not (axes := described.get("axes", "YX")).rstrip("S").endswith("YX"):
+                raise Refused(
+                    f"{file}: expected images of rows and columns, tifffile's axes YX last, got "
+                    f"{shown(axes)}; transpose the array"
+                )
             leading = [*described["shape"]]
             while leading and math.prod(described["shape"][len(leading) :]) < pages[0].size:
                 leading.pop()

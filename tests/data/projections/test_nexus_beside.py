@@ -20,7 +20,8 @@ def test_keys_beside_frames_by_name_that_are_not_used_are_named(layout, tmp_path
     """Of frames, also those that rows of sinograms do not use; keys that do not count are not."""
     values = grey() if layout is None else grey().swapaxes(0, 1)
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        file["raw"], file["data_white"], file["theta"] = values, MASK, TIMES
+        file["raw"], file["theta"] = values, TIMES
+        file["data_white"] = MASK.astype("u2")
         file["pixel_mask"], file["saturation_value"], file["count_time"] = MASK * 0, 65_000, TIMES
         file["energy"], file["description"], file["depends_on"] = 20.0, "corrected", "."
     of_frames = [] if layout is None else ["count_time", "pixel_mask", "saturation_value"]

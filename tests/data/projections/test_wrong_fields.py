@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 import SimpleITK as sitk
 import tifffile
+import torch
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.faults import zingers
+from mvrecon.data.projections.opening import open_projections
 from tests.data.projections.conftest import array, opened
 from tests.data.projections.test_nikon import xtekct
 
@@ -178,3 +181,81 @@ def test_a_flat_field_that_is_given_as_a_number_is_not_saturated(top, tmp_path):
     np.save(tmp_path / "flat.npy", np.full((6, 8), 65_535, "u2"))
     with pytest.raises(Refused, match="between dark and saturated"):
         opened(tmp_path / "a.npy", flat=str(tmp_path / "flat.npy"), find_bad_pixels=False)
+
+
+@pytest.mark.parametrize(
+    ("bits", "types", "warned"),
+    [
+        ((12, 14), ("u2", "u2"), True),
+        ((12, 12), ("u2", "u2"), False),
+        ((12, None), ("u2", "u2"), False),
+        ((None, None), ("u1", "u2"), True),
+        ((12, None), ("u2", "f4"), False),
+    ],
+)
+def test_bits_of_views_and_flat_field_are_compared(bits, types, warned, tmp_path):
+    """As Micro-Manager states them, else those of the pixels' types; means in floats have none."""
+    for name, bit, kind in zip(("views", "flat"), bits, types, strict=True):
+        tags = [] if bit is None else [(51123, "s", 0, f'{{"BitDepth": {bit}}}', True)]
+        values = np.full((2, 6, 8), 200 if name == "flat" else 100).astype(kind)
+        with tifffile.TiffWriter(tmp_path / f"{name}.tif") as file:
+            for value in values:
+                file.write(value, photometric="minisblack", metadata=None, extratags=tags)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        options = {"layout": "projections", "find_bad_pixels": False}
+        opened(tmp_path / "views.tif", flat=str(tmp_path / "flat.tif"), **options)
+    assert any("by its bits" in str(one.message) for one in caught) is warned
+
+
+@pytest.mark.parametrize("level", [-0.5, -1e-3, 0.0])
+def test_zingers_are_found_in_light_below_the_dark_field(level):
+    """Of a dark field from another exposure: noise about a negative level has no end of peaks where
+    these are relative to their neighbours.
+    """
+    noise = torch.randn(1, 24, 32, generator=torch.Generator().manual_seed(0))
+    assert not zingers(level + 1e-3 * noise).any()
+
+
+@pytest.mark.parametrize("axes", ["TXY", "YTX"])
+def test_axes_of_tifffile_and_scifio_are_compared(axes, tmp_path):
+    views = np.full((4, 6, 8), 100, "u2")
+    options = {"photometric": "minisblack"}
+    tifffile.imwrite(tmp_path / "a.tif", views, metadata={"axes": axes}, **options)
+    with pytest.raises(Refused, match=f"axes YX last, got '{axes}'"):
+        opened(tmp_path / "a.tif", flat=200.0)
+    tifffile.imwrite(tmp_path / "a.tif", views, metadata={"axes": "TYX"}, **options)
+    opened(tmp_path / "a.tif", flat=200.0, find_bad_pixels=False)
+    text = "SCIFIO=0.37\naxes=Y,X,Time\nlengths=6,8,4\nimages=4\n"
+    tifffile.imwrite(tmp_path / "a.tif", views, description=text, metadata=None, **options)
+    with pytest.raises(Refused, match="SCIFIO's axes X,Y first, got 'Y,X,Time'"):
+        opened(tmp_path / "a.tif", flat=200.0)
+
+
+@pytest.mark.parametrize(
+    ("labels", "named"),
+    [
+        (["view_0", "view_1", "view_10", "view_2"], "order of images, 'view_10' before 'view_2'"),
+        (["dark_0", "view_0", "view_1", "view_2"], "image 'dark_0'"),
+        (["view_1", "view_2", "view_10", "view_11"], None),
+    ],
+)
+def test_labels_of_images_are_compared_with_their_order(labels, named, tmp_path):
+    """ImageJ's labels of slices, and names of pages."""
+    views = np.full((4, 6, 8), 100, "u2")
+    tifffile.imwrite(tmp_path / "a.tif", views, imagej=True, metadata={"Labels": labels})
+    with tifffile.TiffWriter(tmp_path / "b.tif") as file:
+        for view, label in zip(views, labels, strict=True):
+            tags = [(285, "s", 0, label, True)]
+            file.write(view, photometric="minisblack", metadata=None, extratags=tags)
+    for name in ("a.tif", "b.tif"):
+        stack = open_projections(tmp_path / name)
+        assert list(stack.unknown) == ([] if named is None else [named])
+
+
+def test_unknown_keys_of_a_file_of_bad_pixels_are_named(tmp_path):
+    np.save(tmp_path / "views.npy", np.full((3, 6, 8), 100, "u2"))
+    mask, text = np.zeros((6, 8), "u1"), "rows flipped"
+    tifffile.imwrite(tmp_path / "mask.tif", mask, description=text, metadata=None)
+    with pytest.warns(UserWarning, match="mask.tif: .* ImageDescription: rows flipped"):
+        opened(tmp_path / "views.npy", flat=200.0, bad_pixels=str(tmp_path / "mask.tif")).whole()

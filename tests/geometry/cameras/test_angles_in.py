@@ -178,3 +178,28 @@ def test_a_second_array_behind_the_angles_is_refused(tmp_path):
             np.save(file, np.array(part))
     with pytest.raises(Refused, match="expected one array of"):
         angles_in(tmp_path / "a.npy")
+
+
+TABLES = {
+    "view,exposure": [],
+    "view,exposure,temperature": [],
+    "view,exposure,current_uA": ["current_uA"],
+    "view,exposure,frames": ["frames"],
+    "view,exposure,attenuator_transmission": ["attenuator_transmission"],
+    "view,1/exposure": ["1/exposure"],
+    "view,inverse_exposure,gain": ["inverse_exposure", "gain"],
+    "view,log2 exposure": ["log2 exposure"],
+}
+
+
+@pytest.mark.parametrize("head", TABLES)
+def test_other_columns_that_may_be_factors_of_exposures_are_named(head, tmp_path):
+    """And names of the column by which its numbers are no exposures."""
+    row = ",".join(["1.5"] * head.count(","))
+    (tmp_path / "a.csv").write_text("\n".join([head, *(f"{k},{row}" for k in range(4))]))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        _, numbers = numbers_in(tmp_path / "a.csv", "exposures", re.compile("exposure"))
+    assert numbers == [1.5] * 4
+    found = [str(one.message).split("know: ")[1].split("; if")[0] for one in caught]
+    assert sorted(", ".join(found).split(", ")) == sorted(TABLES[head] or [""])

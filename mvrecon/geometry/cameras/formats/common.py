@@ -141,8 +141,15 @@ STATED = (
 )
 #: The sense of a rotation that is not the one of the cameras, and words in the names of a table's
 #: other columns that would turn, move or scale views.
-CLOCKWISE = r"(?<!counter.)(?<!anti.)(?<![a-z])(clockwise|cw)(?![a-z])"
+TURNED = {r"(?<!counter.)(?<!anti.)(?<![a-z])(clockwise|cw)(?![a-z])": None}
 TURNS = {**IMAGE_EFFECTS, "shift": 0}
+#: Words in the names of other columns of exposures that may be factors of these, and in that of the
+#: exposures that would make them others.
+WEIGHTS = {
+    **IMAGE_EFFECTS,
+    r"current|(?<![a-z])[mu]as?(?![a-z])|frames|attenuat|transmi|dose|filter|monitor": None,
+}
+INVERSE = {r"inver|recipro|(?<!\d)1 ?/|(?<![a-z])log|correct|elapsed|since|cumul": None}
 #: A whole number, or a name, in the first column of a table.
 COUNTED = re.compile(r"\d+|.*[A-Za-z].*")
 #: Names of the columns of angles in a table, among others.
@@ -245,11 +252,11 @@ def _column(
         )
     if found[0]:
         _check_lines(path, names[0], [row[0] for row in rows])
-    others = [name for k, name in enumerate(names) if k != found[0] and has_effect(name, "", TURNS)]
+    turn = known is ANGLE_NAMES
+    other, own = (TURNS, TURNED) if turn else (WEIGHTS, INVERSE)
+    others = [name for k, name in enumerate(names) if k != found[0] and has_effect(name, "", other)]
     name = names[found[0]] if names else title
-    said = [
-        text for text in dict.fromkeys((name, title)) if has_effect(text, "", {CLOCKWISE: None})
-    ]
+    said = [text for text in dict.fromkeys((name, title)) if has_effect(text, "", own)]
     warn_of_unknown(path, [*said, *others])
     numbers = [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
     return name, numbers
