@@ -117,6 +117,12 @@ TEXTS = Key(
     "ignored",
     "texts of any program, unless they contain other entries or words such as scaled",
 )
+#: A date or a time of day, as the value of an entry of any name.
+DATED = re.compile(
+    r"(?=.*\d[-/.:]\d)(\d{2,4}[-/.:]\d\d?[-/.:]\d{2,4})?[T ]*(\d\d?:\d\d(:\d\d([.,]\d+)?)?)?"
+    r" *(Z|[+-]\d\d:?\d\d|am|pm)?",
+    re.IGNORECASE,
+)
 #: Programs that describe images in lines of a name and a value, and marks of their texts.
 MARKS = {
     "ImageJ": r"^ImageJ=",
@@ -164,7 +170,11 @@ def unknown_parts(text: str) -> list[str]:
     program = next((name for name, mark in MARKS.items() if re.search(mark, text, re.M)), "text")
     if program == "Dectris":
         text = LINE.sub(r"\1: \2", text)
-    parts = {f"{program}: {name}": (name, *found) for name, found in statements(text).items()}
+    parts = {
+        f"{program}: {name}": (name, *found)
+        for name, found in statements(text).items()
+        if not DATED.fullmatch(found[0].strip())
+    }
     unknown = unknown_entries({key: value for key, (_, value, _) in parts.items()}, KEYS)
     others = {*unknown_names(map(str.lower, unknown), [TEXTS])}
     shown = {key: brief(*parts[key]) for key in unknown}

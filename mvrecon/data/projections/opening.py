@@ -258,7 +258,8 @@ def _compare_bits(views: ProjectionStack, stack: ProjectionStack, name: str) -> 
     if any(kind.kind not in "iu" or kind.itemsize > 2 for kind in kinds):
         return
     stated = [top != np.iinfo(kind).max for top, kind in zip(tops, kinds, strict=True)]
-    if tops[0] != tops[1] and stated[0] == stated[1]:
+    bits = tops if all(stated) else [kind.itemsize for kind in kinds]  # whatever their sign
+    if bits[0] != bits[1] and stated[0] == stated[1]:
         warnings.warn(
             f"{stack.path}: the {name} field's greatest grey value is {tops[1]:g} by its bits, "
             f"that of the views {tops[0]:g}; are both stored on one scale?",

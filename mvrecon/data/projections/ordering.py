@@ -5,7 +5,7 @@ import re
 import warnings
 from collections.abc import Sequence
 from decimal import Decimal
-from itertools import product, zip_longest
+from itertools import pairwise, product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,9 @@ COMMA = r"(?<![0-9.,])[0-9]+,[0-9]+(?![0-9.,])"
 #: A separator and a minus before a number, which is a sign; and an integer with leading zeros, a
 #: serial number, before which it is none.
 NEGATIVE, PADDED = re.compile("[_= ]-$"), re.compile("0[0-9]+")
+#: A number in a label of an image, with its sign; and labels of images that are no views.
+SIGNED = r"(?:(?<=[_= ])-)?\d+(?:\.\d+)?"
+FIELD_LABEL = re.compile(r"(?<![a-z])(dark|flat)", re.IGNORECASE)
 
 
 def ordered(paths: Sequence[Path], gaps: bool = False, mixed: bool = False) -> list[Path]:
@@ -232,3 +235,14 @@ def _missing(numbers: Sequence[Sequence[Any]]) -> str:
             f"a view of each combination of the numbers, got none of {', '.join(map(str, absent))}"
         )
     return ""
+
+
+def disordered(labels: Sequence[str]) -> list[str]:
+    """How labels of images, which differ in numbers alone, count them in another order than theirs;
+    else labels that call an image a field.
+    """
+    if len({re.sub(SIGNED, "0", label) for label in labels}) != 1:
+        return [f"image {label!r}" for label in labels if FIELD_LABEL.search(label)]
+    counts = [[*map(float, re.findall(SIGNED, label))] for label in labels]
+    wrong = (k for k, (one, other) in enumerate(pairwise(counts)) if other < one)
+    return [f"order of images, {labels[k]!r} before {labels[k + 1]!r}" for k in wrong][:1]

@@ -5,7 +5,6 @@ import re
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from mvrecon.core.files.checks import EDGE, Refused, shown, text_of
 from mvrecon.core.files.keys import Key, check_keys, has_effect, unknown_names
 from mvrecon.data.projections import descriptions
+from mvrecon.data.projections.ordering import disordered
 from mvrecon.data.projections.stack import VIEWS, Header, PlaceInSet
 
 #: Tags of EXIF on which grey values depend, but not in a proportion that all cameras share.
@@ -33,8 +33,6 @@ ANDOR_BEAM = tuple(
 #: Tags with texts of any program: tifffile writes two of the first, ImageJ keeps its Info in the
 #: second.
 TEXTS = ("ImageDescription", "IJMetadata", "GDAL_METADATA")
-#: Labels of images that are no views.
-FIELD_LABEL = re.compile("dark|flat", re.IGNORECASE)
 #: First tag of areaDetector's attributes, which are texts `name:value`.
 AREA_DETECTOR = 65010
 #: Tags of TIFF that change the pixels or their order, and those that ordinary files have; a warning
@@ -242,24 +240,30 @@ def tiff_header(file: Path) -> Header:
         head = first._replace(stated=texts)
         first = descriptions.of_file(file, head, text, own)._replace(places=places, own=own)
         unknown = unknown_names(sorted(found), TIFF_KEYS)
-        first = first._replace(unknown=[*unknown, *_disordered(pages)])
+        others = [*_check_axes(file, pages[0]), *disordered(_labels(pages))]
+        first = first._replace(unknown=[*unknown, *others])
     if _offset(pages[0]):
         return first._replace(dtype=np.dtype("i2"), tops=frozenset([2.0**15 - 1]))
     return first
 
 
-def _disordered(pages: Any) -> list[str]:
-    """Labels of ImageJ, or names of pages, that count images in another order than theirs, or that
-    call some of them fields.
-    """
+def _labels(pages: Any) -> list[str]:
+    """Labels of ImageJ, or names of pages."""
     labels = (pages[0].tags.valueof("IJMetadata") or {}).get("Labels")
-    labels = [str(x or "") for x in labels or [page.tags.valueof("PageName") for page in pages]]
-    fields = [f"image {x!r}" for x in labels if FIELD_LABEL.match(x)]
-    if len({re.sub(r"\d+", "0", label) for label in labels}) != 1:
-        return fields
-    counts = [[*map(int, re.findall(r"\d+", label))] for label in labels]
-    wrong = (k for k, (one, other) in enumerate(pairwise(counts)) if other < one)
-    return [f"order of images, {labels[k]!r} before {labels[k + 1]!r}" for k in wrong][:1]
+    return [str(x or "") for x in labels or [page.tags.valueof("PageName") for page in pages]]
+
+
+def _check_axes(file: Path, page: Any) -> list[str]:
+    """Check that the columns of images are tifffile's axis X; return axes whose rows are not Y, as
+    those of sinograms.
+    """
+    found = [one.get("axes", "YX").rstrip("S") for one in page.parent.shaped_metadata or ()]
+    if wrong := [axes for axes in found if not axes.endswith("X")]:
+        raise Refused(
+            f"{file}: expected images of rows and columns, tifffile's axes YX last, got "
+            f"{shown(wrong[0])}; transpose the array"
+        )
+    return [f"axes={axes}" for axes in found if not axes.endswith("YX")]
 
 
 def _description(file: Path, text: str) -> str:
@@ -497,11 +501,6 @@ def _tiff(file: Path) -> Iterator[tuple[Any, int]]:
         if planes := pages[0].tags.get("UIC2tag"):  # MetaMorph's, behind one page
             images = planes.count
         for described in image.shaped_metadata or ():
-            if not (axes := described.get("axes", "YX")).rstrip("S").endswith("YX"):
-                raise Refused(
-                    f"{file}: expected images of rows and columns, tifffile's axes YX last, got "
-                    f"{shown(axes)}; transpose the array"
-                )
             leading = [*described["shape"]]
             while leading and math.prod(described["shape"][len(leading) :]) < pages[0].size:
                 leading.pop()

@@ -143,7 +143,8 @@ TEXTS = {
     "Title: scaled by 2\nAuthor: me": ["Title: scaled by 2"],
     "software_gain=2\nhostgain=3": ["software_gain", "hostgain"],
     '{"date": {"gain": 2}}': ["date.gain"],
-    "FileName: D:\\a_1.tif\nDateTime: 2020-01-01T12:00:00Z": [],
+    "FileName: D:\\a_1.tif\nTime: 2020-01-01T12:00:00Z\nAcquired: 12:30:05.5": [],
+    "time: 0.1\nTime of a frame: 0.5 s": ["time", "Time of a frame"],
     # Names of detectors of Dectris in another text.
     "# Flat_field corrected\n# Tau = 2 s": ["Flat_field corrected", "Tau"],
     # Numbers and lists below their name, as JSON is indented.

@@ -191,6 +191,7 @@ def test_a_flat_field_that_is_given_as_a_number_is_not_saturated(top, tmp_path):
         ((12, None), ("u2", "u2"), False),
         ((None, None), ("u1", "u2"), True),
         ((12, None), ("u2", "f4"), False),
+        ((None, None), ("i2", "u2"), False),
     ],
 )
 def test_bits_of_views_and_flat_field_are_compared(bits, types, warned, tmp_path):
@@ -217,7 +218,7 @@ def test_zingers_are_found_in_light_below_the_dark_field(level):
     assert not zingers(level + 1e-3 * noise).any()
 
 
-@pytest.mark.parametrize("axes", ["TXY", "YTX"])
+@pytest.mark.parametrize("axes", ["TXY", "YXT"])
 def test_axes_of_tifffile_and_scifio_are_compared(axes, tmp_path):
     views = np.full((4, 6, 8), 100, "u2")
     options = {"photometric": "minisblack"}
@@ -226,6 +227,8 @@ def test_axes_of_tifffile_and_scifio_are_compared(axes, tmp_path):
         opened(tmp_path / "a.tif", flat=200.0)
     tifffile.imwrite(tmp_path / "a.tif", views, metadata={"axes": "TYX"}, **options)
     opened(tmp_path / "a.tif", flat=200.0, find_bad_pixels=False)
+    tifffile.imwrite(tmp_path / "a.tif", views, metadata={"axes": "YTX"}, **options)
+    assert list(open_projections(tmp_path / "a.tif").unknown) == ["axes=YTX"]  # of sinograms
     text = "SCIFIO=0.37\naxes=Y,X,Time\nlengths=6,8,4\nimages=4\n"
     tifffile.imwrite(tmp_path / "a.tif", views, description=text, metadata=None, **options)
     with pytest.raises(Refused, match="SCIFIO's axes X,Y first, got 'Y,X,Time'"):
@@ -238,6 +241,7 @@ def test_axes_of_tifffile_and_scifio_are_compared(axes, tmp_path):
         (["view_0", "view_1", "view_10", "view_2"], "order of images, 'view_10' before 'view_2'"),
         (["dark_0", "view_0", "view_1", "view_2"], "image 'dark_0'"),
         (["view_1", "view_2", "view_10", "view_11"], None),
+        (["tilt -60", "tilt -57", "tilt -1.5", "tilt 3"], None),
     ],
 )
 def test_labels_of_images_are_compared_with_their_order(labels, named, tmp_path):
