@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, file_errors, io_library, shown
-from mvrecon.core.files.keys import SAID, Key, check_keys, has_effect
-from mvrecon.core.files.prose import said
+from mvrecon.core.files.keys import FREE_TEXT, Key, check_keys, has_effect
+from mvrecon.core.files.prose import stated_effects
 
 #: Endings of DICOM files; others are recognised by the bytes from 128 on, or, without these, by a
 #: short element of the group 2 or 8 at their beginning: with a type of two letters, or a length.
@@ -172,7 +172,7 @@ DERIVED = (
         "compared",
         "with compression; a warning names other derivations",
     ),
-    Key(", ".join(TEXTS[:2]), "ignored", SAID),  # the third is also compared, of projections
+    Key(", ".join(TEXTS[:2]), "ignored", FREE_TEXT),  # the third is also compared, of projections
 )
 #: Sequences of functional groups that describe other images.
 OTHERS = re.compile("Referenced|Source|Derivation|Contributing|Original|ConversionSource")
@@ -347,7 +347,9 @@ class DicomImage:
         codes = [code for _, items in self.stated("DerivationCodeSequence") for code in items]
         texts += [str(code.get("CodeMeaning", "")) for code in codes]
         found = [f"derivation {text!r}" for text in texts if text and not COMPRESSED.search(text)]
-        return found + said((name, str(text)) for name in TEXTS for _, text in self.stated(name))
+        return found + stated_effects(
+            (name, str(text)) for name in TEXTS for _, text in self.stated(name)
+        )
 
     def private(self) -> list[str]:
         """Private attributes with a name of pydicom's dictionary by which they may change the

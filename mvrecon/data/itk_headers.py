@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mvrecon.core.files import checks
-from mvrecon.core.files.keys import EFFECTS, SAID, Key, check_keys, check_unknown
-from mvrecon.core.files.prose import said
+from mvrecon.core.files.keys import EFFECTS, FREE_TEXT, Key, check_keys, check_unknown
+from mvrecon.core.files.prose import stated_effects
 
 #: Maximum bytes of a header.
 HEADER = 2**16
@@ -41,7 +41,7 @@ COPIED = (
     Key("0018|7034", "refused", "DICOM's FieldOfViewHorizontalFlip", ("NO",)),
     Key("0028|6100", "refused", "DICOM's subtraction of a mask"),
     Key("0008|0068", "refused", "DICOM's PresentationIntentType", ("FOR PROCESSING",)),
-    Key(", ".join(COPIED_TEXTS), "ignored", SAID),
+    Key(", ".join(COPIED_TEXTS), "ignored", FREE_TEXT),
     Key(
         "????|????, scl_slope, scl_inter, xyzt_units, dim[*], dim_info, pixdim[*], datatype, "
         "bitpix, vox_offset, nifti_type, qform_code*, sform_code*, qfac, qoffset_*, quatern_*, "
@@ -105,7 +105,7 @@ META_KEYS = (
         "ignored",
         "statistics and origin",
     ),
-    Key(", ".join(META_TEXTS), "ignored", SAID),
+    Key(", ".join(META_TEXTS), "ignored", FREE_TEXT),
     Key("ObjectSubType, TransformType", "ignored", "of other objects than images"),
     *COPIED,
 )
@@ -247,7 +247,7 @@ def _meta_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
             f"{path}: expected ElementDataFile last, got {hidden[0]} behind it, which ITK ignores"
         )
     texts = [(name, value) for name, value in pairs if name in (*META_TEXTS, *COPIED_TEXTS)]
-    check_unknown(path, pairs + behind, META_KEYS, META_EFFECTS, said(texts))
+    check_unknown(path, pairs + behind, META_KEYS, META_EFFECTS, stated_effects(texts))
     return entries, place
 
 

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 
 from mvrecon.core.files.checks import Refused, check_file
-from mvrecon.core.files.keys import SAID, Key, check_keys, has_effect, unknown_names
-from mvrecon.core.files.prose import said
+from mvrecon.core.files.keys import FREE_TEXT, Key, check_keys, has_effect, unknown_names
+from mvrecon.core.files.prose import stated_effects
 from mvrecon.data.storage import (
     check_attributes,
     check_chunks,
@@ -57,7 +57,7 @@ ATTRIBUTES = (
         "ignored",
         "texts, links and plots of NeXus and areaDetector",
     ),
-    Key(", ".join(TEXTS), "ignored", SAID),
+    Key(", ".join(TEXTS), "ignored", FREE_TEXT),
     Key(
         "shape, dtype, doc, data_type, dimension, num_pixels_?, num_channels",
         "ignored",
@@ -201,7 +201,9 @@ def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
     Raises:
         Refused: one of `ATTRIBUTES` to refuse.
     """
-    check_keys(place.path, ATTRIBUTES, lambda name: texts_at([place], name).get(place))
+    refused = [name for key in ATTRIBUTES if key.use == "refused" for name in key.names]
+    texts = attributes_at((place, name) for name in (*refused, *TEXTS))
+    check_keys(place.path, ATTRIBUTES, lambda name: texts.get((place, name)))
     with opened(place.path) as file:
         stored: Any = file[place.name]
         names = [
@@ -209,10 +211,10 @@ def unknown_attributes(place: Place, known: Sequence[str] = ()) -> list[str]:
             for name in stored.attrs
             if not has_effect(name, "") and value_in(stored, name, stored.attrs.get_id(name)) != 0
         ]
-        texts = [name for name in TEXTS if name in stored.attrs and name not in known]
     own = place.name.rpartition("/")[2] or "/"
     unknown = [f"{own}@{name}" for name in unknown_names(names, ATTRIBUTES) if name not in known]
-    return unknown + said((f"{own}@{name}", texts_at([place], name)[place]) for name in texts)
+    free = [name for name in TEXTS if (place, name) in texts and name not in known]
+    return unknown + stated_effects((f"{own}@{name}", texts[place, name]) for name in free)
 
 
 def values_at(place: Place, known: tuple[str, ...] = ()) -> np.ndarray:
@@ -258,11 +260,20 @@ def numbers_at(place: Place, attribute: str) -> np.ndarray | None:
 
 def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
     """A text among the attributes of data sets or groups, or the texts that they are (""), where
-    there is one: of several, joined by colons; of another type, its name.
+    there is one; see `attributes_at`.
     """
-    found: dict[Place, str] = {}
-    unread: dict[Path, list[Place]] = {}
-    for place in places:
+    found = attributes_at((place, attribute) for place in places)
+    return {place: text for (place, _), text in found.items()}
+
+
+def attributes_at(wanted: Iterable[tuple[Place, str]]) -> dict[tuple[Place, str], str]:
+    """Texts by their data set or group and attribute, or "" for the text that it is, where there is
+    one: of several, joined by colons; of another type, its name. Those of variable length of a file
+    are read by one process.
+    """
+    found: dict[tuple[Place, str], str] = {}
+    unread: dict[Path, list[tuple[Place, str]]] = {}
+    for place, attribute in wanted:
         with opened(place.path) as file:
             stored: Any = (
                 file[place.name] if attribute else dataset_in(place.path, file, place.name)
@@ -272,18 +283,19 @@ def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
             kind = stored.attrs.get_id(attribute) if attribute else stored
             text, count = h5py.check_string_dtype(kind.dtype), math.prod(kind.shape or ())
             if kind.shape is None:
-                found[place] = ""
+                found[place, attribute] = ""
                 continue
             if text is None or not 0 < count <= MAX_TEXTS or kind.dtype.itemsize > 2**16:
-                found[place] = str(kind.dtype)
+                found[place, attribute] = str(kind.dtype)
                 continue
             if variable(kind.dtype):
-                unread.setdefault(place.path, []).append(place)
+                unread.setdefault(place.path, []).append((place, attribute))
                 continue
             value = stored.attrs[attribute] if attribute else stored[()]
-            found[place] = ":".join(text.decode("utf-8", "replace") for text in np.ravel(value))
+            texts = (text.decode("utf-8", "replace") for text in np.ravel(value))
+            found[place, attribute] = ":".join(texts)
     for path, those in unread.items():
-        names = {f"{place.name}@{attribute}": place for place in those}
+        names = {f"{place.name}@{attribute}": (place, attribute) for place, attribute in those}
         for name, texts in texts_of(path, *names).items():
             found[names[name]] = ":".join(texts)
     return found
@@ -291,18 +303,24 @@ def texts_at(places: Sequence[Place], attribute: str) -> dict[Place, str]:
 
 def units_at(places: Sequence[Place]) -> dict[Place, str]:
     """The unit that each data set states by an attribute of `UNITS`, where there is one."""
-    return {place: text for name in UNITS[::-1] for place, text in texts_at(places, name).items()}
+    found = attributes_at((place, name) for place in places for name in UNITS)
+    return {
+        place: found[place, name]
+        for name in UNITS[::-1]
+        for place in places
+        if (place, name) in found
+    }
 
 
 def units_of(places: Sequence[Place], names: Sequence[str] = UNITS) -> str:
     """The units that data sets state by attributes of these names, several joined by " or "; empty
     without one.
     """
-    stated = {text for name in names for text in texts_at(places, name).values()}
+    stated = {*attributes_at((place, name) for place in places for name in names).values()}
     return " or ".join(sorted(stated - {""}))
 
 
-#: What stands before and behind the name of an axis of a detector; other words before it, as in
+#: Words before and behind the name of an axis of a detector; other words before it, as in
 #: sample_x, are those of a stage.
 BEFORE = (
     "(?:(?:.*[_ .-])?(?:det(?:ector)?|cam(?:era)?|pix(?:el)?|px|image|img|frame|proj(?:ection)?|"
@@ -336,14 +354,16 @@ def check_order(place: Place, axes: Sequence[str], expected: str) -> None:
         Refused: a name of an axis at another's place.
     """
     stated: list[tuple[str, int, str]] = []
-    for attribute in ("DIMENSION_LABELS", "axes", "order"):
-        text = texts_at([place], attribute).get(place, "").strip("[](){} ").lower()
+    orders, sizes = ("DIMENSION_LABELS", "axes", "order"), [f"dim{n}" for n in range(len(axes))]
+    texts = attributes_at((place, name) for name in (*orders, *sizes))
+    for attribute in orders:
+        text = texts.get((place, attribute), "").strip("[](){} ").lower()
         names = _names_of_axes(text, len(axes))
         if attribute == "order" and text and len(names) != len(axes):
             raise Refused(f"{place}: expected {expected}, got the order {text!r}; remove it")
         if len(names) == len(axes):
             stated += [(name, n, attribute) for n, name in enumerate(names)]
-    cil = [texts_at([place], f"dim{n}").get(place, "").lower() for n in range(len(axes))]
+    cil = [texts.get((place, name), "").lower() for name in sizes]
     if all(cil):  # fewer are those of one image
         stated += [(name, n, f"dim{n}") for n, name in enumerate(cil)]
     with opened(place.path) as file:

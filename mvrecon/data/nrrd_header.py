@@ -5,8 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mvrecon.core.files import checks
-from mvrecon.core.files.keys import SAID, Key, check_keys, check_unknown, warn_of_unknown
-from mvrecon.core.files.prose import said
+from mvrecon.core.files.keys import FREE_TEXT, Key, check_keys, check_unknown, warn_of_unknown
+from mvrecon.core.files.prose import stated_effects
 from mvrecon.data.itk_headers import (
     COPIED,
     COPIED_TEXTS,
@@ -63,7 +63,7 @@ NRRD_KEYS = (
     ),
     Key("data file", "refused", "its values in the same file"),
     Key("measurement frame", "ignored", "of vectors"),
-    Key("content", "ignored", SAID),
+    Key("content", "ignored", FREE_TEXT),
     Key("number, labels", "ignored", "repeated by sizes, and texts"),
     Key("min, max, thicknesses", "ignored", "statistics, and extent of a voxel"),
     *COPIED,
@@ -138,7 +138,7 @@ def _nrrd_entries(path: Path, text: str) -> tuple[dict[str, str], int]:
     texts = [("content", entries.get("content", "")), *(p for p in pairs if p[0] in COPIED_TEXTS)]
     texts += [("#", line[1:]) for line in lines[1:count] if line.startswith("#")]
     others = [pair for pair in pairs if pair not in alike]
-    check_unknown(path, others, NRRD_KEYS, META_EFFECTS, said(texts))
+    check_unknown(path, others, NRRD_KEYS, META_EFFECTS, stated_effects(texts))
     entries |= {name: value.strip() for name, value in pairs if name == UNEVEN or "|" in name}
     return entries, sum(len(line) + 1 for line in text.split("\n")[: count + 1])
 

@@ -60,7 +60,7 @@ IMAGE_EFFECTS = {
     "(?<!\\ba)gain": (1, 0),  # 0 dB
 }
 #: Note of a key of free text.
-SAID = "but for a warning of entries such as slope = 2"
+FREE_TEXT = "but for a warning of entries such as slope = 2"
 #: Values of any key with such a word that change nothing.
 OFF = ("no", "none", "off", "false", "unknown")
 #: Unknown keys that a warning names, and characters of a name that are searched for words.
@@ -92,7 +92,7 @@ def check_unknown(
     stated: Iterable[tuple[str, str]],
     keys: Sequence[Key],
     effects: Mapping[str, Any] = EFFECTS,
-    said: Sequence[str] = (),
+    in_texts: Sequence[str] = (),
 ) -> None:
     """Check the keys of a header that are not in the table of its format: those that may change
     what is read are refused, and one warning names the others, unless their values state nothing
@@ -103,7 +103,8 @@ def check_unknown(
         stated: keys of the header with their values.
         keys: table of the format.
         effects: words of unknown keys that change what is read; see `EFFECTS`.
-        said: what the header's texts state (`prose.said`), for the same warning.
+        in_texts: effects that texts of the header state (`prose.stated_effects`), for the same
+            warning.
 
     Raises:
         Refused: an unknown key with one of these words and a value that has an effect, or with the
@@ -122,7 +123,8 @@ def check_unknown(
                 f"{path}: expected keys whose effect is known, got {_brief(name)} {shown(value)}"
                 f"{slip} apply it, and remove the key"
             )
-    warn_of_unknown(path, [*(name for name, _ in unknown if not _neutral(name, effects)), *said])
+    ordinary = [name for name, _ in unknown if not _neutral(name, effects)]
+    warn_of_unknown(path, [*ordinary, *in_texts])
 
 
 def unknown_names(names: Iterable[str], keys: Sequence[Key]) -> list[str]:

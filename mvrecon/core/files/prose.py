@@ -1,4 +1,4 @@
-"""What texts in a header state: entries of any program, and lines of prose."""
+"""Texts in a header: entries of any program, and lines of prose."""
 
 import re
 from collections.abc import Iterable
@@ -28,7 +28,7 @@ WORD = re.compile("|".join(WORDS))
 
 
 def statements(text: str) -> dict[str, tuple[str, str]]:
-    """What a text states, in parts, each with its value: entries (lines of a name and a value,
+    """Return the parts of a text, each with its value: entries (lines of a name and a value,
     JSON, XML) by their names, with their values where these differ; and other lines with letters
     by themselves.
     """
@@ -45,7 +45,7 @@ def statements(text: str) -> dict[str, tuple[str, str]]:
     return found
 
 
-def said(texts: Iterable[tuple[str, str]]) -> list[str]:
+def stated_effects(texts: Iterable[tuple[str, str]]) -> list[str]:
     """The parts of texts that may state what was done to values, behind the names of the texts:
     those with a word of `WORDS`, unless the value of an entry changes nothing.
     """
@@ -53,20 +53,15 @@ def said(texts: Iterable[tuple[str, str]]) -> list[str]:
         f"{title}: {brief(name, *found)}"
         for title, text in texts
         for name, found in statements(text).items()
-        if has_effect(name, found[0], WORDS) or tells(found[0])
+        if has_effect(name, found[0], WORDS) or _word_at(found[0]) >= 0
     ]
-
-
-def tells(value: str) -> bool:
-    """Whether the value of an entry contains a word of `WORDS`."""
-    return _word_at(value) >= 0
 
 
 def brief(name: str, value: str, part: str) -> str:
     """The name of an entry, or the whole part if its value contains further entries or a word of
     `WORDS`, in one line, cut to the characters around its first such word.
     """
-    shown = part if INNER.search(value) or tells(value) else name
+    shown = part if INNER.search(value) or _word_at(value) >= 0 else name
     shown = "".join(filter(str.isprintable, " ".join(shown.split())))
     first = max(0, min(_word_at(shown) - SHOWN // 2, len(shown) - SHOWN))
     cut = shown[first : first + SHOWN]
@@ -74,5 +69,6 @@ def brief(name: str, value: str, part: str) -> str:
 
 
 def _word_at(text: str) -> int:
+    """Where the first word of `WORDS` is in a text; -1 without one."""
     found = WORD.search(text.lower())  # faster than regardless of case
     return found.start() if found else -1

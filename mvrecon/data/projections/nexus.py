@@ -371,8 +371,8 @@ class _Layout(NamedTuple):
         return FrameViews(frames, views, fields, rig, scan, stated, *limits, unknown)
 
     def of_field(self, folder: Path) -> "_Layout":
-        """The layout of frames that may be a field: without angles and pixels, and without what
-        stands beside them for another number of frames, such as views.
+        """The layout of frames that may be a field: without angles and pixels, and without
+        exposures and a key of another number of frames, such as views.
         """
         count = Frames(self.frames, folder).shape[0]
         return self._replace(

@@ -146,7 +146,7 @@ def limits_of(
     it does not state. Compares the order of the frames.
 
     Args:
-        places: what stands beside the frames, see `limits_in`.
+        places: data sets beside the frames, see `limits_in`.
         frames: all frames of the file.
         keys: image_key of each frame.
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.core.files.checks import Refused
-from mvrecon.core.files.keys import warn_of_unknown
+from mvrecon.core.files.keys import IMAGE_EFFECTS, warn_of_unknown
 from mvrecon.core.parts import VIEW_FILES
 from mvrecon.data.dicom_image import dicom_file, same
 from mvrecon.data.linked import UNITS, Place, followed, listing, unknown_attributes, values_at
@@ -24,13 +24,21 @@ from mvrecon.data.projections.nexus import IN_FILE, hdf5_views, in_another
 from mvrecon.data.projections.sinograms import Sinograms, as_rows
 from mvrecon.data.projections.stack import ProjectionStack
 from mvrecon.data.storage import opened
-from mvrecon.geometry.cameras.formats.common import numbers_in
+from mvrecon.geometry.cameras.formats.common import Column, numbers_in
 
 Layout = Literal["projections", "sinogram"]
 Field = float | str | Path | None
 
-#: Names of a table's column of exposures.
-EXPOSURE_NAMES = re.compile(r"exposure|time|mas\b", re.IGNORECASE)
+#: Exposures, relative to the flat field's; with what makes them others, and with other factors.
+EXPOSURES = Column(
+    "exposures",
+    re.compile(r"exposure|time|mas\b", re.IGNORECASE),
+    {r"inver|recipro|(?<!\d)1 ?/|(?<![a-z])log|correct|elapsed|since|cumul": None},
+    {
+        **IMAGE_EFFECTS,
+        r"current|(?<![a-z])[mu]as?(?![a-z])|frames|attenuat|transmi|dose|filter|monitor": None,
+    },
+)
 #: Share by which the means of a flat field's images may differ, as before and after a scan.
 MAX_FLAT_CHANGE = 0.02
 #: Share by which the means of a flat field's parts may differ, as of a beam that moves.
@@ -164,7 +172,7 @@ def exposures(
         warn_of_unknown(place.path, unknown_attributes(place))
     else:
         try:
-            values = np.array(numbers_in(path, "exposures", EXPOSURE_NAMES)[1])
+            values = np.array(numbers_in(path, EXPOSURES)[1])
         except FileNotFoundError as error:
             known = [name for name in stack.stated if exposure_names(stack, name)]
             raise FileNotFoundError(

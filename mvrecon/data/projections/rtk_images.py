@@ -15,15 +15,15 @@ import numpy as np
 
 from mvrecon.core.files.checks import EDGE, Refused, check_declared, io_library
 from mvrecon.core.files.keys import (
+    FREE_TEXT,
     IMAGE_EFFECTS,
-    SAID,
     Key,
     check_keys,
     has_effect,
     unknown_entries,
     unknown_names,
 )
-from mvrecon.core.files.prose import said
+from mvrecon.core.files.prose import stated_effects
 from mvrecon.data.projections.exposures import number_of
 from mvrecon.data.projections.stack import Header
 
@@ -67,7 +67,7 @@ EDF_KEYS = (
     Key("counter_mne, counter_pos", "compared", "the ring's current srcur, as ExposureTime"),
     Key(", ".join(EDF_CURRENTS), "compared", "as srcur, without that counter"),
     Key(", ".join((*EDF_REGION, "energy")), "compared", "of views and flat fields; warned of"),
-    Key("title", "ignored", SAID),
+    Key("title", "ignored", FREE_TEXT),
     Key("optic_used, PSize_*", "ignored", "the pixel size is asked for"),
     Key("Size, HeaderID, EDF_*, VersionNumber, Image", "ignored", "of the file"),
     Key(
@@ -107,7 +107,7 @@ XIM_KEYS = (
         "as ExposureTime and XRayTubeCurrent, where there is no KVNormChamber",
     ),
     Key(", ".join(XIM_BEAM), "compared", "of views and flat fields; warned of"),
-    Key("AcquisitionNotes", "ignored", SAID),
+    Key("AcquisitionNotes", "ignored", FREE_TEXT),
 )
 VARIAN_KEYS = (
     Key("SizeX, SizeY", "applied", "(rows - 1) x columns must be a multiple of 4 in .hnd and .xim"),
@@ -222,7 +222,9 @@ def _check_edf(file: Path) -> tuple[str, dict[str, list[str]], list[str]]:
     current = next(filter(None, currents), "").split() or [""]
     texts = {"ExposureTime": " or ".join(sorted(exposed)), "srcur": current[0]}
     texts |= {name: stated.get(name, "") for name in (*EDF_REGION, "energy")}
-    unknown = unknown_entries(stated, EDF_KEYS) + said([("title", stated.get("title", ""))])
+    unknown = unknown_entries(stated, EDF_KEYS) + stated_effects(
+        [("title", stated.get("title", ""))]
+    )
     return kind, {name: [text] for name, text in texts.items() if text}, unknown
 
 
@@ -263,7 +265,7 @@ def _check_xim(file: Path) -> tuple[dict[str, list[str]], list[str]]:
     stated = {new: [own[name]] for name, new in names.items() if own.get(name)}
     others = unknown_names(own, XIM_KEYS)
     unknown = [name for name in others if has_effect(name, own[name], IMAGE_EFFECTS)]
-    return stated, unknown + said([("AcquisitionNotes", own.get("AcquisitionNotes", ""))])
+    return stated, unknown + stated_effects([("AcquisitionNotes", own.get("AcquisitionNotes", ""))])
 
 
 def _of_varian(file: Path) -> tuple[dict[str, list[str]], list[str]]:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from mvrecon.methods.classical.orbit import Orbit
+from mvrecon.methods.classical.steps import FULL_TURN
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class Missing:
         else:
             s, turn, density = orbit.radius * q.sin(), q, q.cos()
         # direction of the line's normal, in the orbit's plane, from the first view's tangent
-        beta = start + (torch.arange(count, dtype=torch.float64) + 0.5) * (2 * math.pi / count)
+        beta = start + (torch.arange(count, dtype=torch.float64) + 0.5) * (FULL_TURN / count)
         theta = beta - turn[:, None]
         tangent = torch.linalg.cross(orbit.axis, orbit.outwards[0])
         x, y = offset @ orbit.outwards[0], offset @ tangent

@@ -998,7 +998,7 @@ FLATS = {
 @pytest.mark.parametrize("inside", [True, False])
 @pytest.mark.parametrize("case", FLATS)
 def test_flat_fields_in_a_group_or_file_of_their_own(case, inside, tmp_path):
-    """They need no angles, and what stands beside them is of them. Tried beside these: the same for
+    """They need no angles, and the data sets beside them are theirs. Also tried: the same for
     dark fields, and frames of NXtomo whose angles are all alike.
     """
     keys, time = (FLATS[case].get(name) for name in ("keys", "time"))

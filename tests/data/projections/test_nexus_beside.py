@@ -1,4 +1,4 @@
-"""What stands beside frames in HDF5 and is not used is named; moves of sample and detector.
+"""Data sets beside frames in HDF5 that are not used are named; moves of sample and detector.
 
 Truth: the definitions of NeXus and of Data Exchange. Tried beside these: control data and energies,
 links to frames, fields and masks in other files, and translations that nxtomo writes as tx.
@@ -45,7 +45,7 @@ def test_keys_of_which_another_is_used_are_known(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["gain", "count_time", "pixel_mask", "x_flipped", "image_key"])
-def test_what_stands_beside_parts_of_virtual_frames_is_named(name, tmp_path):
+def test_data_sets_beside_parts_of_virtual_frames_are_named(name, tmp_path):
     """Unless the file of the frames states it itself, as image_key."""
     with h5py.File(tmp_path / "raw.h5", "w") as file:
         file["camera/data"], file[f"camera/{name}"] = frames(), 2
@@ -58,7 +58,7 @@ def test_what_stands_beside_parts_of_virtual_frames_is_named(name, tmp_path):
     assert named(path) == ([] if name == "image_key" else [name])
 
 
-def test_what_stands_beside_a_linked_field_of_data_exchange_is_named(tmp_path):
+def test_data_sets_beside_a_linked_field_of_data_exchange_are_named(tmp_path):
     other = exchange(tmp_path / "air.h5", gain=2.0)
     path = exchange(tmp_path / "a.h5", data_white=None)
     with h5py.File(path, "a") as file:

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from mvrecon.core.files.checks import Refused
+from mvrecon.data.projections.opening import EXPOSURES
+from mvrecon.geometry.cameras.formats import common
 from mvrecon.geometry.cameras.formats.common import angles_in, numbers_in
 from mvrecon.geometry.cameras.rigs import circular, parallel
 
@@ -127,7 +129,7 @@ def test_lines_in_another_order_than_they_state_are_refused(case, tmp_path):
     with pytest.raises(Refused, match="lines in the order of the views, got"):
         angles_in(tmp_path / "a.csv")
     with pytest.raises(Refused, match="lines in the order of the views, got"):
-        numbers_in(tmp_path / "a.csv", "exposures", re.compile("angle"))
+        numbers_in(tmp_path / "a.csv", EXPOSURES._replace(names=re.compile("angle")))
 
 
 @pytest.mark.parametrize(
@@ -146,7 +148,9 @@ def test_a_first_column_that_counts_no_views_is_no_order(head, first, tmp_path):
     (tmp_path / "a.csv").write_text("\n".join([head, *(f"{x},{k}" for k, x in enumerate(first))]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        numbers = numbers_in(tmp_path / "a.csv", "angles", re.compile("^theta"))[1]
+        numbers = numbers_in(
+            tmp_path / "a.csv", common.ANGLES._replace(names=re.compile("^theta"))
+        )[1]
     assert numbers == [0.0, 1.0, 2.0]
 
 
@@ -199,7 +203,7 @@ def test_other_columns_that_may_be_factors_of_exposures_are_named(head, tmp_path
     (tmp_path / "a.csv").write_text("\n".join([head, *(f"{k},{row}" for k in range(4))]))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        _, numbers = numbers_in(tmp_path / "a.csv", "exposures", re.compile("exposure"))
+        _, numbers = numbers_in(tmp_path / "a.csv", EXPOSURES)
     assert numbers == [1.5] * 4
     found = [str(one.message).split("know: ")[1].split("; if")[0] for one in caught]
     assert sorted(", ".join(found).split(", ")) == sorted(TABLES[head] or [""])

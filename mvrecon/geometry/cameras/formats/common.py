@@ -3,10 +3,10 @@
 import inspect
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -139,21 +139,34 @@ UNITS = {
 STATED = (
     r"(^|_|[(\[:=/]|\bin|angles?|theta|rotation)\s*({0})\s*(\.?$|[)\],;(])|\bin\s+({0})(?![\w.])"
 )
-#: The sense of a rotation that is not the one of the cameras, and words in the names of a table's
-#: other columns that would turn, move or scale views.
-TURNED = {r"(?<!counter.)(?<!anti.)(?<![a-z])(clockwise|cw)(?![a-z])": None}
-TURNS = {**IMAGE_EFFECTS, "shift": 0}
-#: Words in the names of other columns of exposures that may be factors of these, and in that of the
-#: exposures that would make them others.
-WEIGHTS = {
-    **IMAGE_EFFECTS,
-    r"current|(?<![a-z])[mu]as?(?![a-z])|frames|attenuat|transmi|dose|filter|monitor": None,
-}
-INVERSE = {r"inver|recipro|(?<!\d)1 ?/|(?<![a-z])log|correct|elapsed|since|cumul": None}
 #: A whole number, or a name, in the first column of a table.
 COUNTED = re.compile(r"\d+|.*[A-Za-z].*")
-#: Names of the columns of angles in a table, among others.
-ANGLE_NAMES = re.compile("angle|theta|rotation|degree", re.IGNORECASE)
+
+
+class Column(NamedTuple):
+    """A column of numbers in a table.
+
+    Args:
+        what: name of the numbers in messages.
+        names: pattern of the column's name.
+        own: words in its name, or in the comment before it, that a warning names, see
+            `has_effect`: by these the numbers are others.
+        others: words in names of other columns that a warning names.
+    """
+
+    what: str
+    names: re.Pattern
+    own: Mapping[str, Any]
+    others: Mapping[str, Any]
+
+
+#: Angles; with another sense of rotation than the cameras', and what turns, moves or scales views.
+ANGLES = Column(
+    "angles",
+    re.compile("angle|theta|rotation|degree", re.IGNORECASE),
+    {r"(?<!counter.)(?<!anti.)(?<![a-z])(clockwise|cw)(?![a-z])": None},
+    {**IMAGE_EFFECTS, "shift": 0},
+)
 
 
 def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
@@ -169,7 +182,7 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
         FileNotFoundError: nothing is there.
         Refused: not one column of finite numbers, another unit, or too many.
     """
-    name, angles = numbers_in(path, "angles", ANGLE_NAMES)
+    name, angles = numbers_in(path, ANGLES)
     units = [
         (stated.start(), degrees)
         for unit, degrees in UNITS.items()
@@ -183,20 +196,19 @@ def angles_in(path: str | Path, small_arc: bool = False) -> list[float]:
     return angles
 
 
-def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, list[float]]:
+def numbers_in(path: str | Path, wanted: Column) -> tuple[str, list[float]]:
     """Numbers, one for each view, as `angles_in` reads them, and the name of their column, or the
     comment before them, if any.
 
     Args:
         path: path of the file.
-        what: name of the numbers in messages.
-        names: pattern of the name of a table's column.
+        wanted: the numbers' column.
 
     Raises:
         FileNotFoundError: nothing is there.
         Refused: not one column of finite numbers, or too many.
     """
-    path = Path(path).expanduser()
+    path, what = Path(path).expanduser(), wanted.what
     name, column = "", None
     if not path.exists():
         file, _, column = str(path).rpartition(":")
@@ -211,15 +223,13 @@ def numbers_in(path: str | Path, what: str, names: re.Pattern) -> tuple[str, lis
             if not np.isfinite(numbers).all():
                 raise Refused(f"{path}: expected finite {what}, got some that are NaN or infinite")
         else:
-            name, numbers = _column(path, column, what, names)
+            name, numbers = _column(path, column, wanted)
         if not 0 < len(numbers) <= VIEWS:
             raise Refused(f"{path}: expected 1 to {VIEWS} {what}, got {len(numbers)}")
     return name, numbers
 
 
-def _column(
-    path: Path, column: str | None, what: str, known: re.Pattern
-) -> tuple[str, list[float]]:
+def _column(path: Path, column: str | None, wanted: Column) -> tuple[str, list[float]]:
     """The name of a column of a text, else the comment before it, and its numbers."""
     parts = [line.partition("#") for line in text_of(path, strict=False).splitlines()]
     lines = [line.strip(" ") for line, _, _ in parts if line.strip()]
@@ -235,7 +245,7 @@ def _column(
     widths = {*map(len, rows)}
     if names and mark is None and widths == {1}:
         names = [lines[0].strip(" \"'")]  # blanks are part of the name
-    found = [k for k, name in enumerate(names) if known.search(name)]
+    found = [k for k, name in enumerate(names) if wanted.names.search(name)]
     if column is not None:
         found = [k for k, name in enumerate(names) if name == column]
     elif widths == {1}:
@@ -244,7 +254,9 @@ def _column(
         got = (
             f"the columns {', '.join(names)}" if names else f"{len(rows[0]) if rows else 0} columns"
         )
-        raise Refused(f"{path}: expected one column of {what}, or <file>:<column>, got {got}")
+        raise Refused(
+            f"{path}: expected one column of {wanted.what}, or <file>:<column>, got {got}"
+        )
     if names and widths != {len(names)} or len(widths) != 1:
         raise Refused(
             f"{path}: expected as many numbers in every line{' as names' if names else ''}, got "
@@ -252,12 +264,11 @@ def _column(
         )
     if found[0]:
         _check_lines(path, names[0], [row[0] for row in rows])
-    turn = known is ANGLE_NAMES
-    other, own = (TURNS, TURNED) if turn else (WEIGHTS, INVERSE)
-    others = [name for k, name in enumerate(names) if k != found[0] and has_effect(name, "", other)]
     name = names[found[0]] if names else title
-    said = [text for text in dict.fromkeys((name, title)) if has_effect(text, "", own)]
-    warn_of_unknown(path, [*said, *others])
+    unknown = [text for text in dict.fromkeys((name, title)) if has_effect(text, "", wanted.own)]
+    others = (other for k, other in enumerate(names) if k != found[0])
+    unknown += [other for other in others if has_effect(other, "", wanted.others)]
+    warn_of_unknown(path, unknown)
     numbers = [number(row[found[0]], f"line {k}") for k, row in enumerate(rows, 1)]
     return name, numbers
 
@@ -270,7 +281,7 @@ def _check_lines(path: Path, name: str, texts: Sequence[str]) -> None:
         Refused: they are in another, as that of names sorted as text: view_10 before view_2.
     """
     counts = [re.findall(r"\d+", Path(text).stem) for text in texts]
-    if ANGLE_NAMES.search(name) or not all(counts) or not all(map(COUNTED.fullmatch, texts)):
+    if ANGLES.names.search(name) or not all(counts) or not all(map(COUNTED.fullmatch, texts)):
         return
     numbers = [int(count[-1]) for count in counts]
     if sorted(numbers) != numbers and (np.diff(sorted(numbers)) == 1).all():

@@ -20,7 +20,7 @@ import numpy as np
 from mvrecon.core.files.atomic import written_whole
 from mvrecon.core.files.checks import EDGE, VOLUME, Refused, file_beside, plain_name, shown, text_of
 from mvrecon.core.files.keys import Key, check_keys, check_unknown
-from mvrecon.core.files.prose import said
+from mvrecon.core.files.prose import stated_effects
 from mvrecon.core.registry import hint
 from mvrecon.geometry.cameras.formats.common import number
 from mvrecon_spect.files.interfile_keys import (
@@ -173,7 +173,7 @@ def read_header(path: str | Path, content: Content) -> Header:
             raise Refused(f"{path}: expected '{name} := value', got {shown(line)}")
         unknown += [(str(name), line)] * (name.base not in table)
     texts = [(name.base, value) for name, value in pairs if name.base in TEXTS]
-    check_unknown(path, unknown, (*KEYS, *CONTENT[content]), EFFECTS, said(texts))
+    check_unknown(path, unknown, (*KEYS, *CONTENT[content]), EFFECTS, stated_effects(texts))
     return Header(path, values)
 
 

@@ -115,7 +115,7 @@ KEYS = (
         "ignored",
         "origin",
     ),
-    Key(", ".join(TEXTS), "ignored", keys.SAID),
+    Key(", ".join(TEXTS), "ignored", keys.FREE_TEXT),
     Key(
         "isotope, isotope name, isotope gamma halflife (sec), radionuclide, radionuclide name, "
         "radionuclide halflife (sec), radiopharmaceutical, dosage, collimator, collimator name, "
